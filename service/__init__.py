@@ -1,0 +1,1 @@
+"""HTTP and people: the API, the Python client and the command line."""
