@@ -5,7 +5,7 @@ SolverError
 ├── InvalidBasis          a basis that cannot be built or used: which function, and why
 ├── InvalidDescriptor     a descriptor that cannot be computed or compared
 ├── InvalidSoftMap        coefficients or targets that are no soft map: which row, and its value
-└── SingularSystem        a linear system without a trustworthy solution: which face, and its pivot or residual
+└── SingularSystem        a linear system without a trustworthy solution: which face, and its pivot
 
 Every one carries ``index`` and ``value`` where there is a culprit, so that an HTTP answer can name it.
 """

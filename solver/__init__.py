@@ -1,0 +1,1 @@
+"""Soft maps between triangle meshes."""
