@@ -1,1 +1,81 @@
-"""Soft maps between triangle meshes."""
+"""Soft maps between triangle meshes, and how continuous they are (Solomon, Guibas, Butscher, SGP 2013).
+
+======================  ==================  ==========  ==================================================
+symbol                  code                shape       meaning
+======================  ==================  ==========  ==================================================
+M₀, M                   source, target                  triangle meshes, each scaled to total area 1
+β₀ᵢ, βⱼ                 basis.functions     (V, n)      partition of unity, values at vertices
+μⱼ                      basis.densities     (F, n)      per-face mean of βⱼ over its integral
+C                       coefficients        (n₀, n)     the soft map: C ≥ 0, rows sum to 1
+V_f^s                   frames              (F₀, 2, 3)  orthonormal tangents of each source face
+q_f^s                   potential           (F₀, 2, n)  transportation potential
+e(f)                    dirichlet.density   (F₀,)       Dirichlet energy per unit source area
+b(t)                    bijectivity.density (F,)        mass received per unit target area
+======================  ==================  ==========  ==================================================
+
+>>> import numpy as np
+>>> around, across = np.meshgrid(np.arange(24), np.arange(12), indexing="ij")
+>>> index = around * 12 + across
+>>> a, b, c, d = (np.roll(index, step, (0, 1)).ravel() for step in [(0, 0), (-1, 0), (-1, -1), (0, -1)])
+>>> s, t = np.pi * around.ravel() / 12, np.pi * across.ravel() / 6
+>>> vertices = np.stack([(3 + np.cos(t)) * np.cos(s), (3 + np.cos(t)) * np.sin(s), np.sin(t)], axis=1)
+>>> torus = Mesh(vertices, np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]))
+>>> basis = poisson_basis(torus, size=40)
+>>> identity = SoftMap.from_points(basis, basis, np.arange(torus.n_vertices))
+>>> nothing = SoftMap.uniform(basis, basis)
+>>> bool(dirichlet(identity).energy > 1), bool(dirichlet(nothing).energy < 1e-20)
+(True, True)
+>>> round(bijectivity(nothing).energy, 9)
+1.0
+"""
+
+from solver.basis import Basis, poisson_basis
+from solver.descriptors import Spectrum, hks, hks_of, spectrum, wks, wks_of
+from solver.energy import (
+    Bijectivity,
+    Dirichlet,
+    bijectivity,
+    dirichlet,
+    dirichlet_block,
+    gather_dirichlet,
+)
+from solver.errors import (
+    InvalidBasis,
+    InvalidDescriptor,
+    InvalidMesh,
+    InvalidSoftMap,
+    SingularSystem,
+    SolverError,
+)
+from solver.mesh import Mesh
+from solver.potential import FACE_BLOCK, Potential, potential, potential_block
+from solver.softmap import SoftMap
+
+__all__ = [
+    "FACE_BLOCK",
+    "Basis",
+    "Bijectivity",
+    "Dirichlet",
+    "InvalidBasis",
+    "InvalidDescriptor",
+    "InvalidMesh",
+    "InvalidSoftMap",
+    "Mesh",
+    "Potential",
+    "SingularSystem",
+    "SoftMap",
+    "SolverError",
+    "Spectrum",
+    "bijectivity",
+    "dirichlet",
+    "dirichlet_block",
+    "gather_dirichlet",
+    "hks",
+    "hks_of",
+    "poisson_basis",
+    "potential",
+    "potential_block",
+    "spectrum",
+    "wks",
+    "wks_of",
+]

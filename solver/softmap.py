@@ -21,6 +21,8 @@ from solver.mesh import FloatArray
 
 #: How far a row of given coefficients may be from summing to 1; ours are within 1e-14.
 ROW_SUM_TOLERANCE = 1e-9
+#: Descriptors that vary less than this, relative to their size, differ by rounding alone.
+SMALLEST_VARIATION = 1e-13
 #: Entries of ρ_fine held at once by one thread when comparing descriptors (16 MB).
 BLOCK_ENTRIES = 2**21
 
@@ -120,7 +122,8 @@ class SoftMap:
         if not 0 < sigma < np.inf:
             raise InvalidDescriptor("sigma must be positive and finite", value=float(sigma))
         scale = sigma * root_mean_square_distance(source, target, f0, f)
-        if not 0 < scale < np.inf:
+        size = max(np.abs(f0).max(), np.abs(f).max())
+        if not SMALLEST_VARIATION * size < scale < np.inf:
             raise InvalidDescriptor("the descriptors do not vary", value=float(scale))
         coefficients = np.zeros((source.size, target.size))
         # Centred on the target, so that ‖a‖² + ‖b‖² − 2ab loses no digits to a common offset.

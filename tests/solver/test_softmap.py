@@ -20,12 +20,12 @@ ROW_SUM = 1e-12
 
 @pytest.fixture(scope="module")
 def sphere() -> Basis:
-    return poisson_basis(icosphere(3), size=40)
+    return poisson_basis(icosphere(2), size=40)
 
 
 @pytest.fixture(scope="module")
 def ring() -> Basis:
-    return poisson_basis(torus(24, 12), size=30)
+    return poisson_basis(torus(12, 8), size=30)
 
 
 def dense_projection(source: Basis, target: Basis, fine: np.ndarray) -> np.ndarray:
