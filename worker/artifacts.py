@@ -10,7 +10,7 @@ import secrets
 import time
 from collections import Counter, deque
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
 import numpy.typing as npt
@@ -107,28 +107,41 @@ class Artifacts:
             raise ValueError(f"{id_!r} is no id of the kind {kind}")
         standing = self.manifest(id_)
         if standing is None:
-            written: list[str] = []
-            copy = secrets.token_hex(8)
-            try:
-                lenders: list[Manifest] = []
-                stored = {name: self._stored(array, written, lenders) for name, array in arrays.items()}
-                self._objects.settle_blobs()
-                manifest = Manifest(
-                    id_, kind, spec, dict(parents), dict(values), stored, dict(made), now(), copy
-                )  # fmt: skip
-                standing = self._established(manifest, lenders)
-            finally:
-                # Also when a deadline struck after the manifest was created: then the blobs are in use.
-                if not self._stands(id_, copy):
-                    self._delete_blobs(written)
+            standing = self._written(
+                Manifest(
+                    id=id_,
+                    kind=kind,
+                    spec=spec,
+                    parents=dict(parents),
+                    values=dict(values),
+                    arrays={},
+                    made=dict(made),
+                    created_at=now(),
+                    copy=secrets.token_hex(8),
+                ),
+                arrays,
+            )
         self._adopt(standing, adopts)
         return standing
 
-    def _stored(
-        self, array: Array | BorrowedBlocks, written: list[str], lenders: list[Manifest]
-    ) -> StoredArray:
-        if not isinstance(array, BorrowedBlocks):
-            return blocks.write_array(self._objects, array, written)
+    def _written(self, manifest: Manifest, arrays: Mapping[str, Array | BorrowedBlocks]) -> Manifest:
+        """Write blobs, then a manifest; returns the one that stands."""
+        own = {name: array for name, array in arrays.items() if not isinstance(array, BorrowedBlocks)}
+        written: list[str] = []
+        lenders: list[Manifest] = []
+        try:
+            stored = blocks.write_arrays(self._objects, own, written)
+            for name, array in arrays.items():
+                if isinstance(array, BorrowedBlocks):
+                    stored[name] = self._borrowed(array, lenders)
+            self._objects.settle_blobs()
+            return self._established(replace(manifest, arrays=stored), lenders)
+        finally:
+            # A deadline may strike after the manifest was created: then its blobs are in use.
+            if not self._stands(manifest.id, manifest.copy):
+                self._delete_blobs(written)
+
+    def _borrowed(self, array: BorrowedBlocks, lenders: list[Manifest]) -> StoredArray:
         borrowed = [(self._required(id_), name) for id_, name in array.pieces]
         lenders += [lender for lender, _ in borrowed]
         try:
@@ -144,8 +157,8 @@ class Artifacts:
         while not self._objects.create(key, seal(manifest)):
             if standing := self.manifest(manifest.id):
                 return standing
-        # Whoever forgets a lender deletes its manifest first and looks afterwards who else refers to its blobs.
-        # So if all lenders still stand, this manifest will be seen by then.
+        # Whoever forgets a lender deletes its manifest first and only then looks who else uses its blobs.
+        # So if all lenders still stand, this manifest will be seen.
         for lender in lenders:
             if not self._stands(lender.id, lender.copy):
                 self._objects.delete(key)
@@ -315,8 +328,8 @@ class Artifacts:
         old = {blob.name for blob in self._objects.listing("blobs") if blob.age >= older_than}
         orphans = old - self._referenced()
         if orphans:
-            # A borrower may have been created behind the first look, its lenders dropped ahead of it. But none is
-            # dropped before its borrower stands, so a second look sees that one.
+            # A borrower may have been created behind the first look, its lenders dropped ahead of it. As they
+            # are not dropped before it stands, a second look sees it.
             orphans -= self._referenced()
         self._delete_blobs(orphans)
         for read in self._objects.listing("reads"):

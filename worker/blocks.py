@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections import deque
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Final
 
@@ -16,8 +16,8 @@ from worker.objects import Bytes, Objects
 
 #: Bytes of a block: one is read and verified in 10 ms, and a hundred make a large array.
 BLOCK_BYTES: Final = 8 * 2**20
-#: Threads that write the blocks of one array, beside the one that hashes the whole.
-_WRITERS: Final = 2
+#: Threads that write blocks, beside the one that hashes whole arrays; they wait for the disk together.
+_WRITERS: Final = 4
 
 Array = npt.NDArray[Any]
 
@@ -26,13 +26,13 @@ class DamagedBlock(Exception):
     """A block that is missing or is not what was written."""
 
 
-def write_array(objects: Objects, array: Array, written: list[str]) -> StoredArray:
-    """Write an array's rows into new blobs.
+def write_arrays(objects: Objects, arrays: Mapping[str, Array], written: list[str]) -> dict[str, StoredArray]:
+    """Write the rows of arrays into new blobs.
 
     Parameters
     ----------
     objects : Objects
-    array : ndarray
+    arrays : mapping of ndarray
         float64, int64, int32 or bool, with at least one axis; of any byte order and layout.
     written : list of str
         Gets the name of every blob as it is written, so that they can be deleted whatever happens.
@@ -40,41 +40,47 @@ def write_array(objects: Objects, array: Array, written: list[str]) -> StoredArr
     Raises
     ------
     TypeError, ValueError
-        If it has another element type, or no axis.
+        If one has another element type, or no axis; then nothing is written.
     """
-    dtype = array.dtype.name
-    if dtype not in DTYPES:
-        raise TypeError(f"an array of {dtype} cannot be stored, only of {', '.join(DTYPES)}")
-    if array.ndim == 0:
-        raise ValueError("an array without axes cannot be stored")
-    row_bytes = array.dtype.itemsize * int(np.prod(array.shape[1:], dtype=object))
-    height = max(1, BLOCK_BYTES // row_bytes) if row_bytes else 1
-    starts = range(0, array.shape[0] if row_bytes else 0, height)
+    for array in arrays.values():
+        if array.dtype.name not in DTYPES:
+            raise TypeError(f"an array of {array.dtype} cannot be stored, only of {', '.join(DTYPES)}")
+        if array.ndim == 0:
+            raise ValueError("an array without axes cannot be stored")
 
-    def rows(start: int) -> Bytes:
-        piece = np.ascontiguousarray(array[start : start + height], dtype=DTYPES[dtype])
-        return piece.reshape(-1).view(np.uint8)
-
-    def write(content: Bytes) -> Block:
+    def write(content: Bytes, rows: int) -> Block:
         digest = hashlib.sha256(content.data).hexdigest()
         written.append(objects.write_blob(content))
-        return Block(blob=written[-1], rows=content.size // row_bytes, sha256=digest)
+        return Block(blob=written[-1], rows=rows, sha256=digest)
 
-    if len(starts) == 1:
-        only = write(rows(0))
-        return StoredArray(array.shape, dtype, only.sha256, (only,))
-    whole = hashlib.sha256()
-    blocks: list[Block] = []
+    digests: dict[str, str] = {}
+    waiting: dict[str, list[Future[Block]]] = {}
     with ThreadPoolExecutor(_WRITERS) as pool:
-        waiting: deque[Future[Block]] = deque()
-        for start in starts:
-            content = rows(start)
-            waiting.append(pool.submit(write, content))
-            whole.update(content.data)
-            if len(waiting) > 2 * _WRITERS:  # bounds the copies of an array that is not contiguous
-                blocks.append(waiting.popleft().result())
-        blocks += [future.result() for future in waiting]
-    return StoredArray(array.shape, dtype, whole.hexdigest(), tuple(blocks))
+        for name, array in arrays.items():
+            whole = hashlib.sha256()
+            waiting[name] = futures = []
+            for rows, content in _pieces(array):
+                futures.append(pool.submit(write, content, rows))
+                whole.update(content.data)
+                if len(futures) > 2 * _WRITERS:  # bounds the copies of an array that is not contiguous
+                    futures[-2 * _WRITERS].result()
+            digests[name] = whole.hexdigest()
+    return {
+        name: StoredArray(
+            array.shape, array.dtype.name, digests[name], tuple(future.result() for future in waiting[name])
+        )
+        for name, array in arrays.items()
+    }
+
+
+def _pieces(array: Array) -> Iterator[tuple[int, Bytes]]:
+    """Blocks of rows: how many, and their bytes."""
+    row_bytes = array.dtype.itemsize * math.prod(array.shape[1:])
+    if row_bytes:
+        height = max(1, BLOCK_BYTES // row_bytes)
+        for start in range(0, array.shape[0], height):
+            piece = np.ascontiguousarray(array[start : start + height], dtype=DTYPES[array.dtype.name])
+            yield piece.shape[0], piece.reshape(-1).view(np.uint8)
 
 
 def join(objects: Objects, pieces: Sequence[StoredArray]) -> StoredArray:

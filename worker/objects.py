@@ -95,7 +95,7 @@ class Objects:
         _flush(self._folder / "blobs")
 
     def touch(self, key: str) -> None:
-        """Make an empty object's age zero; losing this in a crash is no loss."""
+        """Make an empty object, or its age zero; a power cut may undo this."""
         path = self._folder / key
         try:
             path.touch()
@@ -125,15 +125,16 @@ class Objects:
         """Whether there is such an object."""
         return (self._folder / key).is_file()
 
-    def names(self, folder: str) -> list[str]:
-        """Names of all objects under ``{folder}/``, sorted."""
+    def names(self, folder: str, prefix: str = "") -> list[str]:
+        """Names of all objects under ``{folder}/`` that begin with a prefix, sorted."""
         try:
-            return sorted(os.listdir(self._folder / folder))  # noqa: PTH208  (ten times faster than paths)
+            found = os.listdir(self._folder / folder)  # noqa: PTH208  (ten times faster than paths)
         except (FileNotFoundError, NotADirectoryError):
             return []
+        return sorted(name for name in found if name.startswith(prefix))
 
-    def listing(self, folder: str) -> Iterator[Listed]:
-        """All objects under ``{folder}/``, in no order, with their sizes and ages."""
+    def listing(self, folder: str, prefix: str = "") -> Iterator[Listed]:
+        """Objects under ``{folder}/`` that begin with a prefix, in no order, with sizes and ages."""
         now = time.time()
         try:
             entries = os.scandir(self._folder / folder)
@@ -141,6 +142,8 @@ class Objects:
             return
         with entries:
             for entry in entries:
+                if not entry.name.startswith(prefix):
+                    continue
                 with suppress(FileNotFoundError):  # deleted meanwhile
                     status = entry.stat()
                     yield Listed(entry.name, status.st_size, now - status.st_mtime)

@@ -104,9 +104,10 @@ class JobRecords:
     Parameters
     ----------
     objects : Objects
-        Where they are kept: ``jobs/{id}/{revision}``, ``open/{id}`` and ``recent/{when}-{id}``.
+        Where they are kept: ``jobs/{end of id}/{id}.{revision}``, and the empty markers ``open/{id}`` and
+        ``recent/{when}-{id}``, which a power cut may take and `remark` restores.
     answered : callable
-        Whether the artifact of an id stands.
+        Whether the artifact of an id stands, or did until it was forgotten.
     """
 
     def __init__(self, objects: Objects, answered: Callable[[str], bool]) -> None:
@@ -118,7 +119,7 @@ class JobRecords:
         if kind_of(record.id) is None:
             raise ValueError(f"{record.id!r} is no id")
         # Markers first: one without a record is passed over, a record without them would be forgotten.
-        self._objects.create(f"recent/{cursor(record)}")
+        self._objects.touch(f"recent/{cursor(record)}")
         self._mark(record)
         while True:
             revision, standing = self._newest(record.id)
@@ -151,7 +152,7 @@ class JobRecords:
                 return standing
             if (changed.id, changed.created_at) != (standing.id, standing.created_at):
                 raise ValueError("the id and created_at of a job never change")
-            # Before, lest a crash in between forgets it, and after, for `unfinished` may have deleted the first.
+            # Before, lest a crash in between forgets it; and after, for `unfinished` may have deleted it.
             self._mark(changed)
             if self._create(changed, revision + 1):
                 self._mark(changed)
@@ -188,17 +189,27 @@ class JobRecords:
         if record is not None and self._unfinished(record):
             self._mark(record)
 
-    def is_lost(self, record: JobRecord) -> bool:
-        """Whether a record should be among the unfinished ones and is not, after a crash."""
-        return self._unfinished(record) and not self._objects.exists(f"open/{record.id}")
+    def remark(self) -> int:
+        """Restore markers that were lost; returns of how many records."""
+        restored = 0
+        for folder in self._objects.names("jobs"):
+            for id_ in {name.partition(".")[0] for name in self._objects.names(f"jobs/{folder}")}:
+                record = self.read(id_)
+                if record is not None:
+                    markers = [f"recent/{cursor(record)}"] + [f"open/{id_}"] * self._unfinished(record)
+                    missing = [marker for marker in markers if not self._objects.exists(marker)]
+                    for marker in missing:
+                        self._objects.touch(marker)
+                    restored += bool(missing)
+        return restored
 
     def delete(self, id_: str) -> None:
         """Delete a record."""
         record = self.read(id_)
         if record is None:
             return
-        for name in reversed(self._objects.names(f"jobs/{id_}")):
-            self._objects.delete(f"jobs/{id_}/{name}")
+        for name in reversed(self._revisions(id_)):
+            self._objects.delete(f"{_folder(id_)}/{name}")
         self._objects.delete(f"open/{id_}")
         self._objects.delete(f"recent/{cursor(record)}")
 
@@ -207,27 +218,37 @@ class JobRecords:
 
     def _mark(self, record: JobRecord) -> None:
         if record.outcome is None and not self._objects.exists(f"open/{record.id}"):
-            self._objects.create(f"open/{record.id}")
+            self._objects.touch(f"open/{record.id}")
+
+    def _revisions(self, id_: str) -> list[str]:
+        """Names of all revisions, oldest first."""
+        return self._objects.names(_folder(id_), prefix=f"{id_}.") if kind_of(id_) else []
 
     def _newest(self, id_: str) -> tuple[int, JobRecord | None]:
         """Highest revision number, -1 without any, and the newest record that is as it was written."""
-        names = self._objects.names(f"jobs/{id_}") if kind_of(id_) else []
+        names = self._revisions(id_)
+        newest = int(names[-1].rpartition(".")[2]) if names else -1
         for name in reversed(names):
-            content = self._objects.read(f"jobs/{id_}/{name}")
+            content = self._objects.read(f"{_folder(id_)}/{name}")
             record = unseal(_RECORD, content) if content is not None else None
             if record is not None:
-                return int(names[-1]), record
-        return (int(names[-1]) if names else -1), None
+                return newest, record
+        return newest, None
 
     def _create(self, record: JobRecord, revision: int) -> bool:
-        return self._objects.create(f"jobs/{record.id}/{revision:08d}", seal(record))
+        return self._objects.create(f"{_folder(record.id)}/{record.id}.{revision:08d}", seal(record))
 
     def _prune(self, id_: str, newest: int) -> None:
         """Delete old revisions, but none that a stalled writer could create anew."""
         if newest % _MANY_REVISIONS == 0:
-            for one in self._objects.listing(f"jobs/{id_}"):
-                if int(one.name) < newest - 1 and one.age > _KEPT_SECONDS:
-                    self._objects.delete(f"jobs/{id_}/{one.name}")
+            for one in self._objects.listing(_folder(id_), prefix=f"{id_}."):
+                if one.name < f"{id_}.{newest - 1:08d}" and one.age > _KEPT_SECONDS:
+                    self._objects.delete(f"{_folder(id_)}/{one.name}")
+
+
+def _folder(id_: str) -> str:
+    """Folder of a record's revisions: 256 of them keep listings short."""
+    return f"jobs/{id_[-2:]}"
 
 
 def cursor(record: JobRecord) -> str:

@@ -46,7 +46,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Swept:
-    """What a sweep removed, blobs and files of writers that died, and the open jobs that it listed again."""
+    """What a sweep removed, blobs and files of writers that died, and jobs whose markers it restored."""
 
     blobs: int
     files: int
@@ -64,7 +64,7 @@ class Store(Artifacts):
 
     def __init__(self, root: Path) -> None:
         super().__init__(Objects(root))
-        self._records = JobRecords(self._objects, self.has)
+        self._records = JobRecords(self._objects, lambda id_: self.has(id_) or self.gone(id_) is not None)
 
     @cached_property
     def identity(self) -> str:
@@ -108,11 +108,12 @@ class Store(Artifacts):
         return self._records.newest_first(after)
 
     def open_jobs(self) -> Iterator[JobRecord]:
-        """Records without outcome and without artifact."""
+        """Records without outcome and without artifact or tombstone."""
         return self._records.unfinished()
 
     def reopen_job(self, id_: str) -> None:
-        """List a job among the open ones again, because its artifact went away and is to be made anew."""
+        """List a job among the open ones, because its artifact is to be made again; removes the tombstone."""
+        self.forget_gone(id_)
         self._records.reopen(id_)
 
     def delete_job(self, id_: str) -> None:
@@ -120,7 +121,7 @@ class Store(Artifacts):
         self._records.delete(id_)
 
     def sweep(self, older_than: float = 86_400.0) -> Swept:
-        """Remove what dead writers left behind, and find open jobs that are listed nowhere.
+        """Remove what dead writers left behind, and restore what a power cut took from listings.
 
         Parameters
         ----------
@@ -129,9 +130,4 @@ class Store(Artifacts):
         """
         files = self._objects.discard_aside(older_than)
         blobs = self.discard_orphans(older_than)
-        lost = [
-            record.id for record in self.jobs() if self._records.is_lost(record) and not self.gone(record.id)
-        ]
-        for id_ in lost:
-            self.reopen_job(id_)
-        return Swept(blobs=blobs, files=files, jobs=len(lost))
+        return Swept(blobs=blobs, files=files, jobs=self._records.remark())
