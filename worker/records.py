@@ -71,6 +71,8 @@ class JobRecord:
         None while it is open, and when its artifact stands.
     problem : dict or None
         Why it failed.
+    started_at : str or None
+        When the first of its tasks began, once it has an outcome.
     finished_at : str or None
         When it got its outcome.
     """
@@ -82,6 +84,7 @@ class JobRecord:
     tasks: tuple[TaskRecord, ...] = ()
     outcome: Literal["failed", "dismissed"] | None = None
     problem: dict[str, Any] | None = None
+    started_at: str | None = None
     finished_at: str | None = None
 
 

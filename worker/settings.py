@@ -68,6 +68,17 @@ class Settings(BaseSettings):
         allow_inf_nan=False,
         description="Largest estimate of one job, in seconds of one task.",
     )
+    task_memory_bytes: int = Field(
+        default=8_000_000_000,
+        ge=1,
+        description="Most memory that one task may take, in bytes; a question that needs more is refused.",
+    )
+    shard_seconds: float = Field(
+        default=10.0,
+        gt=0,
+        allow_inf_nan=False,
+        description="Estimate above which an energy or a potential is split among workers, in seconds.",
+    )
     max_queued: int = Field(
         default=1_000, ge=1, description="Tasks that may wait at once; above, a new job is answered 429."
     )
