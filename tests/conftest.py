@@ -8,11 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import redis
+from threadpoolctl import threadpool_limits
 
 from service.embedded import EmbeddedRedis
 
 #: Real meshes with ground truth, kept beside a checkout; tests that need them skip where they are missing.
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_blas_thread() -> Iterator[None]:
+    """Pin BLAS as workers do: two test processes with a pool each would spin against one another."""
+    with threadpool_limits(1):
+        yield
 
 
 @pytest.fixture(scope="session")
