@@ -13,10 +13,31 @@ import numpy as np
 
 from service.parsing.polygons import Floats, Ints, InvalidFile, Limits, TooLarge
 
-__all__ = ["FORMATS", "InvalidFile", "Limits", "ParsedMesh", "TooLarge", "read_mesh", "sniffed"]
+__all__ = [
+    "FORMATS",
+    "MEDIA_TYPES",
+    "InvalidFile",
+    "Limits",
+    "ParsedMesh",
+    "TooLarge",
+    "read_mesh",
+    "sniffed",
+]
 
 #: The formats, each the name of a module here with ``read(content, limits)``.
 FORMATS = ("off", "obj", "ply", "stl", "glb")
+
+#: What a Content-Type may say of them; it rarely does.
+MEDIA_TYPES = {
+    "model/obj": "obj",
+    "model/stl": "stl",
+    "application/sla": "stl",
+    "application/vnd.ms-pki.stl": "stl",
+    "model/gltf-binary": "glb",
+    "model/ply": "ply",
+    "application/ply": "ply",
+    "model/off": "off",
+}
 
 
 @dataclass(frozen=True, eq=False)

@@ -181,7 +181,8 @@ def _placements(header: Header) -> Iterator[tuple[int, Floats]]:
         node = nodes[_natural(index)]
         matrix = parent @ _local(node)
         if "mesh" in node:
-            yield _natural(node["mesh"]), matrix
+            header["meshes"][_natural(node["mesh"])]  # an IndexError if there is no such mesh
+            yield node["mesh"], matrix
         stack += [(child, matrix, depth + 1) for child in reversed(node.get("children", []))]
 
 
