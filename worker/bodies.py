@@ -116,11 +116,20 @@ def array_from_lists(value: object, dtype: Dtype | None, ndim: int, pointer: str
     try:
         array: npt.NDArray[Any] = np.array(level, dtype=made)
     except OverflowError:
-        raise SpecError((pointer, f"A number is too large for {made}")) from None
+        bad = next(k for k, number in enumerate(level) if not _fits(number, made))
+        raise SpecError((pointer + _place(bad, shape), f"Input should fit {made}")) from None
     if made == "float64" and not np.isfinite(array).all():
         bad = int(np.flatnonzero(~np.isfinite(array))[0])
         raise SpecError((pointer + _place(bad, shape), "Input should be a finite number"))
     return array.reshape(shape)
+
+
+def _fits(number: float, dtype: Dtype) -> bool:
+    try:
+        np.array(number, dtype=dtype)
+    except OverflowError:
+        return False
+    return True
 
 
 def _place(flat: int, shape: list[int]) -> str:

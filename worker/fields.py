@@ -52,7 +52,7 @@ def kind_of(id_: str) -> str | None:
 
 @dataclass(frozen=True)
 class Parent:
-    """Marks a field that holds the id of one of some kinds; `entries` says what an inline list becomes.
+    """Marks a field that holds a parent's id, and says what may stand inline in its place.
 
     Attributes
     ----------
@@ -126,7 +126,15 @@ def validated(model: type[Model], fields: Mapping[str, Any], pointer: str) -> Mo
         return model.model_validate(dict(fields))
     except ValidationError as error:
         found = error.errors(include_url=False, include_context=False, include_input=False)
-    raise SpecError(*((pointer + _pointer(one["loc"], fields), one["msg"]) for one in found[:MAX_ERRORS]))
+    # Pydantic quotes a tag that it does not know; everything else it says names only what it wants.
+    errors = [
+        (
+            pointer + _pointer(one["loc"], fields),
+            "Input should be of a known type" if one["type"] == "union_tag_invalid" else one["msg"],
+        )
+        for one in found[:MAX_ERRORS]
+    ]
+    raise SpecError(*errors)
 
 
 def escaped(key: str) -> str:

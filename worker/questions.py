@@ -175,8 +175,9 @@ class _Reader:
 
     def _model(self, model: type[_M], fields: dict[str, Any], pointer: str, depth: int) -> _M:
         """Make a model of fields, inline parents and lists replaced by their ids."""
-        for key in fields.keys() - model.model_fields.keys():
-            self._note(pointer + escaped(key), "There is no such field")
+        for key in fields:
+            if key not in model.model_fields:
+                self._note(pointer + escaped(key), "There is no such field")
         known = {key: value for key, value in fields.items() if key in model.model_fields}
         for key, value in known.items():
             mark, many = specs.parent_mark(model, key)
