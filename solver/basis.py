@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from scipy import sparse
+from scipy.linalg import lapack
 from scipy.sparse import linalg
 
 from solver.errors import InvalidBasis
@@ -18,6 +19,9 @@ from solver.mesh import FloatArray, IntArray, Mesh
 
 #: How far a row of a stored basis may be from summing to 1: rounding of a few additions, nothing else.
 ROW_SUM_TOLERANCE = 1e-12
+
+#: Functions of norm 1 whose distance from the span of others is below the root of this are dependent.
+RANK_TOLERANCE = 1e-12
 
 #: The share of `poisson_basis` in its progress that choosing samples takes.
 SAMPLING_SHARE = 0.25
@@ -41,8 +45,8 @@ class Basis:
     Raises
     ------
     InvalidBasis
-        Shapes that do not match, values that are negative or not finite, rows that do not sum to 1, a function
-        that is zero everywhere, samples or cells out of range.
+        Shapes that do not match, values that are negative or not finite, rows that do not sum to 1, functions
+        that are zero everywhere, samples or cells out of range.
     """
 
     mesh: Mesh
@@ -67,6 +71,30 @@ class Basis:
     def size(self) -> int:
         """Number of functions n."""
         return int(self.functions.shape[1])
+
+    def require_independent(self) -> None:
+        """Refuse linearly dependent functions, with which a target's potential would not be unique.
+
+        Raises
+        ------
+        InvalidBasis
+            Naming a function that is a combination of others. On a source such a basis is harmless.
+
+        Notes
+        -----
+        Few functions are often dependent: where each cell touches all others, all functions are the same.
+        """
+        weighted = sparse.diags_array(mass(self.mesh)) @ self.functions
+        gram = (self.functions.T @ weighted).toarray()
+        scale = 1 / np.sqrt(gram.diagonal())
+        _, pivots, rank, _ = lapack.dpstrf(gram * scale * scale[:, None], tol=RANK_TOLERANCE)
+        if rank < self.size:
+            j = int(pivots[rank:].min()) - 1
+            message = (
+                f"function {j}, at vertex {self.samples[j]}, is a combination of others "
+                f"({self.size} functions of rank {rank}); ask for more functions, or for one"
+            )
+            raise InvalidBasis(message, index=j, value=int(rank))
 
     @cached_property
     def integrals(self) -> FloatArray:
@@ -192,7 +220,7 @@ def _bumps(
 
 
 class _Laplacians:
-    """The cotangent stiffness, then the intrinsic Delaunay one, which is computed only where it is needed."""
+    """The stiffness matrices to try, each computed only when the one before was not enough somewhere."""
 
     def __init__(self, mesh: Mesh) -> None:
         self._mesh = mesh
@@ -247,7 +275,11 @@ def _cut(f: FloatArray, lowest: float, cutoff: float) -> FloatArray:
 
 
 def _checked_functions(mesh: Mesh, given: Any) -> sparse.csr_array:
-    functions = sparse.csr_array(given, dtype=np.float64, copy=True)
+    try:
+        functions = sparse.csr_array(given, dtype=np.float64, copy=True)
+        functions.check_format(full_check=True)
+    except (ValueError, TypeError) as error:
+        raise InvalidBasis(f"functions are no sparse matrix of real numbers: {error}") from error
     if functions.ndim != 2 or functions.shape[0] != mesh.n_vertices or functions.shape[1] == 0:
         message = f"functions must have one row for each of {mesh.n_vertices} vertices, not {functions.shape}"
         raise InvalidBasis(message, value=str(functions.shape))

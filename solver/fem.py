@@ -9,6 +9,7 @@ import numpy.typing as npt
 import robust_laplacian
 from scipy import sparse
 
+from solver.errors import InvalidMesh
 from solver.mesh import FloatArray, IntArray, Mesh
 
 
@@ -91,7 +92,8 @@ def intrinsic_delaunay_stiffness(mesh: Mesh) -> sparse.csr_array:
     Parameters
     ----------
     mesh : Mesh
-        Any mesh; where it is non-manifold, its tufted cover is used (Sharp and Crane 2020).
+        Any mesh. Its tufted cover is used, two sheets joined at boundaries and non-manifold edges (Sharp and
+        Crane 2020), so edges near a boundary may pass behind it.
 
     Returns
     -------
@@ -101,13 +103,16 @@ def intrinsic_delaunay_stiffness(mesh: Mesh) -> sparse.csr_array:
     Raises
     ------
     InvalidMesh
-        Never here: the mesh was checked when it was made.
+        The triangulation could not be made.
     """
     kept = np.flatnonzero(mesh.referenced)
     renumbered = np.cumsum(mesh.referenced) - 1
-    laplacian, _ = robust_laplacian.mesh_laplacian(mesh.unit_vertices[kept], renumbered[mesh.faces])
+    try:
+        laplacian, _ = robust_laplacian.mesh_laplacian(mesh.unit_vertices[kept], renumbered[mesh.faces])
+    except RuntimeError as error:  # whatever the C++ library throws
+        raise InvalidMesh(f"the mesh has no intrinsic Delaunay triangulation: {error}") from error
     upper = sparse.coo_array(sparse.triu(laplacian, k=1))
-    # Rounding leaves some entries of flat edges slightly positive; a Delaunay edge has none.
+    # Rounding makes some entries of flat edges slightly positive; a Delaunay edge has none.
     entries = np.minimum(upper.data, 0.0)
     return _with_zero_row_sums(kept[upper.row], kept[upper.col], entries, mesh.n_vertices)
 

@@ -123,7 +123,7 @@ def _checked_first(mesh: Mesh, size: int, first: int | list[int] | IntArray) -> 
         raise InvalidBasis("first must be a vertex or a list of vertices", value=str(first)[:80])
     vertices = raw.astype(np.int64)
     n_candidates = int(mesh.referenced.sum())
-    if not 1 <= size <= n_candidates:
+    if not isinstance(size, int | np.integer) or not 1 <= size <= n_candidates:
         raise InvalidBasis(f"size must be between 1 and the {n_candidates} vertices of the mesh", value=size)
     for k, vertex in enumerate(vertices):
         if not 0 <= vertex < mesh.n_vertices or not mesh.referenced[vertex]:

@@ -257,7 +257,8 @@ def _checked_vertices(given: Any) -> FloatArray:
         raise InvalidMesh(f"vertices must have shape (V, 3), not {raw.shape}", value=str(raw.shape))
     if len(raw) == 0:
         raise InvalidMesh("the mesh has no vertices", value=0)
-    vertices = np.array(raw, dtype=np.float64, order="C")
+    with np.errstate(over="ignore"):  # a long double beyond 1e308 becomes inf, and is refused as that
+        vertices = np.array(raw, dtype=np.float64, order="C")
     bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
     if bad.size:
         value = str(vertices[bad[0]].tolist())
