@@ -6,6 +6,7 @@ absent, ranged reads, listings, deletions.
 
 from __future__ import annotations
 
+import math
 import secrets
 import time
 from collections import Counter, deque
@@ -157,10 +158,11 @@ class Artifacts:
         while not self._objects.create(key, seal(manifest)):
             if standing := self.manifest(manifest.id):
                 return standing
-        # Whoever forgets a lender deletes its manifest first and only then looks who else uses its blobs.
-        # So if all lenders still stand, this manifest will be seen.
+        # Whoever forgets a lender leaves a tombstone, deletes its manifest, and only then looks who else uses
+        # its blobs. So if no lender was forgotten by now, this manifest will be seen. A lender missing without
+        # tombstone was adopted by a twin of this writer, on behalf of this very manifest.
         for lender in lenders:
-            if not self._stands(lender.id, lender.copy):
+            if not self._stands(lender.id, lender.copy) and (self.has(lender.id) or self.gone(lender.id)):
                 self._objects.delete(key)
                 raise GoneArtifact(lender.id, "was forgotten while its blocks were borrowed")
         self.forget_gone(manifest.id)
@@ -174,6 +176,7 @@ class Artifacts:
                 self._objects.delete(f"artifacts/{id_}")
                 self._delete_blobs(adopted.blobs - standing.blobs)
                 self._objects.delete(f"reads/{id_}")
+            self.forget_gone(id_)
 
     def has(self, id_: str) -> bool:
         """Whether an artifact stands."""
@@ -306,13 +309,15 @@ class Artifacts:
         total = sum(sizes.values())
         if total <= max_bytes:
             return ()
-        unread = {read.name: read.age for read in self._objects.listing("reads")}
+        reads = {read.name: read.age for read in self._objects.listing("reads")}
+
+        def unread(manifest: Manifest) -> float:
+            return min(age(manifest.created_at), reads.get(manifest.id, math.inf))
+
         standing = list(self._all())
         holders = Counter(blob for manifest in standing for blob in manifest.blobs)
         forgotten: list[Manifest] = []
-        for manifest in sorted(
-            standing, key=lambda one: unread.get(one.id, age(one.created_at)), reverse=True
-        ):
+        for manifest in sorted(standing, key=unread, reverse=True):
             if total <= max_bytes:
                 break
             if manifest.kind not in _UPLOADED_KINDS and manifest.id not in keep:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
+from functools import cache
 from typing import Annotated, Any, ClassVar, Final, Literal, get_args
 
 import numpy as np
@@ -275,6 +276,7 @@ PUBLIC_KINDS: Final = tuple(kind for kind, model in KINDS.items() if not model.p
 UPLOADED_KINDS: Final = ("mesh", "array")
 
 
+@cache
 def parent_mark(model: type[BaseModel], field: str) -> tuple[Parent | None, bool]:
     """How a field holds parents: its mark, or None, and whether it holds a list of them."""
     info = model.model_fields[field]

@@ -216,14 +216,6 @@ def test_a_job_whose_artifact_was_forgotten_is_open_when_it_is_asked_again(store
     assert store.gone(id_()) is None
 
 
-def test_a_tombstone_learns_its_question_from_the_job(store, folder):
-    store.write_job(record())
-    answer(store)
-    (folder / "artifacts" / id_()).write_bytes(b"nonsense")
-    assert store.manifest(id_()) is None
-    assert store.gone(id_()).spec == {"kind": "energy"}
-
-
 def test_an_open_job_is_listed_whatever_races(store):
     """A reconciler deletes the marker of a finished job while somebody asks for it again."""
     store.write_job(record())
@@ -245,17 +237,6 @@ def test_an_open_job_is_listed_whatever_races(store):
     finally:
         stop.set()
         reconciler.join()
-
-
-def test_a_sweep_restores_markers_that_were_lost(store, folder):
-    store.write_job(record(0))
-    store.write_job(record(1, outcome="failed"))
-    for marker in [*(folder / "open").iterdir(), *(folder / "recent").iterdir()]:
-        marker.unlink()
-    assert store.sweep(0).jobs == 2
-    assert open_ids(store) == {id_(0)}
-    assert {job.id for job in store.jobs()} == {id_(0), id_(1)}
-    assert store.sweep(0).jobs == 0
 
 
 def test_a_marker_without_record_is_passed_over_and_goes_when_it_is_old(store, folder):
