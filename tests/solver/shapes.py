@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
@@ -99,6 +101,12 @@ def together(*meshes: Mesh, gap: float = 3.0) -> Mesh:
         faces.append(mesh.faces + count)
         count += mesh.n_vertices
     return Mesh(np.concatenate(vertices), np.concatenate(faces))
+
+
+def load(path: Path) -> Mesh:
+    """Read a mesh file with its vertices in the file's order."""
+    loaded = trimesh.load(path, process=False, maintain_order=True, skip_materials=True, force="mesh")
+    return Mesh(loaded.vertices, loaded.faces)
 
 
 def moved(mesh: Mesh, rng: np.random.Generator, scale: float = 1.0) -> Mesh:
