@@ -1,0 +1,222 @@
+"""How large a question is, and what answering it costs in seconds and bytes.
+
+Sizes come from specs and manifests alone, so they are known before anything is computed. Coefficients were
+measured on one core and are meant to be right within a factor of two or three.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import log2
+from typing import Final
+
+from worker import specs
+from worker.specs import Spec
+from worker.store import Manifest, Store
+
+#: Blocks of this many source faces are one shard; the solver's sums go by the same blocks.
+FACE_BLOCK: Final = 4096
+_FLOAT: Final = 8
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a task is expected to take: `seconds` on one machine, `bytes` of memory beyond the bare worker."""
+
+    seconds: float
+    bytes: int
+
+
+@dataclass(frozen=True)
+class MeshSize:
+    """Counts of a mesh."""
+
+    n_vertices: int
+    n_faces: int
+    n_components: int
+
+
+@dataclass(frozen=True)
+class BasisSize:
+    """A mesh's counts and the number of functions on it."""
+
+    mesh: MeshSize
+    n_functions: int
+
+
+@dataclass(frozen=True)
+class MapSize:
+    """Both ends of a soft map."""
+
+    source: BasisSize
+    target: BasisSize
+
+
+@dataclass(frozen=True, eq=False)
+class Sizes:
+    """Sizes of what ids name, without computing anything.
+
+    Parameters
+    ----------
+    store : Store
+        Knows the meshes and arrays.
+    spec_of : callable
+        Spec of a computed id.
+
+    Raises
+    ------
+    LookupError
+        By every method, if something on the way is unknown.
+    """
+
+    store: Store
+    spec_of: Callable[[str], Spec | None]
+    _manifests: dict[str, Manifest] = field(default_factory=dict)
+
+    def manifest(self, id_: str) -> Manifest:
+        """Manifest of an upload."""
+        if id_ not in self._manifests:
+            manifest = self.store.manifest(id_)
+            if manifest is None:
+                raise LookupError(id_)
+            self._manifests[id_] = manifest
+        return self._manifests[id_]
+
+    def mesh(self, id_: str) -> MeshSize:
+        """Size of a mesh."""
+        manifest = self.manifest(id_)
+        return MeshSize(
+            n_vertices=manifest.arrays["vertices"].shape[0],
+            n_faces=manifest.arrays["faces"].shape[0],
+            n_components=int(manifest.values["n_components"]),
+        )
+
+    def array(self, id_: str) -> tuple[tuple[int, ...], str]:
+        """Shape and type of an array."""
+        stored = self.manifest(id_).arrays["array"]
+        return stored.shape, stored.dtype
+
+    def basis(self, id_: str) -> BasisSize:
+        """Size of a basis."""
+        spec = self.spec_of(id_)
+        if not isinstance(spec, specs.Basis):
+            raise LookupError(id_)
+        return BasisSize(self.mesh(spec.mesh), spec.size)
+
+    def descriptor(self, id_: str) -> tuple[int, int]:
+        """Rows and columns of a descriptor or of an array in its place."""
+        spec = self.spec_of(id_)
+        if isinstance(spec, specs.Descriptor):
+            return self.mesh(spec.mesh).n_vertices, spec.count
+        shape, _ = self.array(id_)
+        return shape[0], shape[1]
+
+    def softmap(self, id_: str) -> MapSize:
+        """Size of a soft map."""
+        spec = self.spec_of(id_)
+        if not isinstance(spec, specs.SoftMap):
+            raise LookupError(id_)
+        return MapSize(self.basis(spec.source), self.basis(spec.target))
+
+
+def basis_cost(spec: specs.Basis, sizes: Sizes) -> Cost:
+    """Samples by fast marching, then one small sparse solve a function."""
+    n_vertices = sizes.mesh(spec.mesh).n_vertices
+    seconds = 0.02 + 6e-6 * n_vertices * log2(2 + spec.size) + 2.5e-4 * spec.size
+    return Cost(seconds, 3_000 * n_vertices + 20_000 * spec.size)
+
+
+def spectrum_cost(spec: specs.Spectrum, sizes: Sizes) -> Cost:
+    """Lanczos iterations on a sparse factorisation."""
+    n_vertices = sizes.mesh(spec.mesh).n_vertices
+    pairs = min(spec.eigenpairs, n_vertices)
+    seconds = 0.05 + 5e-9 * n_vertices * pairs**2 + 2e-6 * n_vertices * pairs
+    return Cost(seconds, _FLOAT * n_vertices * (3 * pairs + 200))
+
+
+def descriptor_cost(spec: specs.Descriptor, sizes: Sizes) -> Cost:
+    """One product of squared eigenfunctions with filters."""
+    n_vertices = sizes.mesh(spec.mesh).n_vertices
+    pairs = min(spec.eigenpairs, n_vertices)
+    seconds = 0.02 + 2e-9 * n_vertices * pairs * spec.count
+    return Cost(seconds, _FLOAT * n_vertices * (2 * pairs + 2 * spec.count))
+
+
+def softmap_cost(spec: specs.SoftMap, sizes: Sizes) -> Cost:
+    """Projections are sparse; comparing descriptors visits every pair of vertices."""
+    source, target = sizes.basis(spec.source), sizes.basis(spec.target)
+    entries = source.n_functions * target.n_functions
+    seconds = 0.05 + 4e-9 * entries
+    memory = 4 * _FLOAT * entries + 2_000 * (source.mesh.n_vertices + target.mesh.n_vertices)
+    if isinstance(spec.map, specs.Descriptors):
+        _, columns = sizes.descriptor(spec.map.source)
+        seconds += (4e-9 + 1e-10 * columns) * source.mesh.n_vertices * target.mesh.n_vertices
+        memory += _FLOAT * columns * (source.mesh.n_vertices + target.mesh.n_vertices) + 100_000_000
+    if isinstance(spec.map, specs.Mixture):
+        seconds += 4e-9 * entries * len(spec.map.maps)
+        memory += _FLOAT * entries * len(spec.map.maps)
+    return Cost(seconds, memory)
+
+
+def solve_seconds(size: MapSize, n_faces: int) -> float:
+    """Time of the solve for some source faces: assembly, a factorisation and two substitutions each."""
+    n = size.target.n_functions
+    setup = 0.05 + 1e-5 * (size.source.mesh.n_faces + size.target.mesh.n_faces)
+    return setup + n_faces * (4e-5 + 4e-7 * n + 6e-9 * n**2 + 2.5e-11 * n**3)
+
+
+def solve_bytes(size: MapSize, n_faces: int) -> int:
+    """Memory of that solve, but for what it returns: the tensor W, and a batch of systems."""
+    n = size.target.n_functions
+    return (
+        3_000 * (size.source.mesh.n_faces + size.target.mesh.n_faces) + 64 * 3 * _FLOAT * n**2 + 64 * n_faces
+    )
+
+
+def energy_block_cost(spec: specs.EnergyBlock, sizes: Sizes) -> Cost:
+    """One block of faces."""
+    return _energy(sizes.softmap(spec.softmap), spec.stop - spec.start, spec.gradient)
+
+
+def energy_cost(spec: specs.Energy, sizes: Sizes) -> Cost:
+    """All faces, and the bijectivity energy."""
+    size = sizes.softmap(spec.softmap)
+    return _energy(size, size.source.mesh.n_faces, spec.gradient)
+
+
+def _energy(size: MapSize, n_faces: int, gradient: bool) -> Cost:
+    entries = size.source.n_functions * size.target.n_functions
+    memory = solve_bytes(size, n_faces) + _FLOAT * entries * (5 if gradient else 2)
+    return Cost(solve_seconds(size, n_faces) * (1.5 if gradient else 1.0), memory)
+
+
+def potential_block_cost(spec: specs.PotentialBlock, sizes: Sizes) -> Cost:
+    """One block of faces."""
+    return _potential(sizes.softmap(spec.softmap), spec.stop - spec.start)
+
+
+def potential_cost(spec: specs.Potential, sizes: Sizes) -> Cost:
+    """All faces."""
+    size = sizes.softmap(spec.softmap)
+    return _potential(size, size.source.mesh.n_faces)
+
+
+def _potential(size: MapSize, n_faces: int) -> Cost:
+    row = 2 * size.target.n_functions + 6
+    # Solved, then written block by block: 30 ns a number covers hashing and the disk.
+    seconds = solve_seconds(size, n_faces) + 3e-8 * row * n_faces
+    return Cost(seconds, solve_bytes(size, n_faces) + 2 * _FLOAT * row * n_faces)
+
+
+def gathering_cost(size: MapSize, n_faces: int, gradient: bool) -> Cost:
+    """Adding up the shards of an energy, or naming those of a potential."""
+    entries = size.source.n_functions * size.target.n_functions
+    n_blocks = -(-n_faces // FACE_BLOCK)
+    memory = 5 * _FLOAT * entries + 3_000 * (n_faces + size.target.mesh.n_faces)
+    return Cost(0.2 + n_blocks * (0.01 + (1e-8 * entries if gradient else 0)), memory)
+
+
+def blocks(n_faces: int) -> list[tuple[int, int]]:
+    """Blocks [start, stop) that the faces fall into, in order."""
+    return [(start, min(start + FACE_BLOCK, n_faces)) for start in range(0, n_faces, FACE_BLOCK)]
