@@ -159,7 +159,7 @@ class Artifacts:
             if standing := self.manifest(manifest.id):
                 return standing
         # Whoever forgets a lender leaves a tombstone, deletes its manifest, and only then looks who else uses
-        # its blobs. So if no lender was forgotten by now, this manifest will be seen. A lender missing without
+        # its blobs. So if no lender was forgotten by now, this manifest will be seen. One missing without a
         # tombstone was adopted by a twin of this writer, on behalf of this very manifest.
         for lender in lenders:
             if not self._stands(lender.id, lender.copy) and (self.has(lender.id) or self.gone(lender.id)):

@@ -64,7 +64,7 @@ LAYOUTS = {
 DTYPES = st.sampled_from(["<f8", ">f8", "<i8", ">i8", "<i4", ">i4", "?"])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(hnp.arrays(DTYPES, hnp.array_shapes(min_side=0, max_dims=4)), st.sampled_from(list(LAYOUTS)))
 def test_an_array_comes_back_as_it_went_in(array, layout):
     array = LAYOUTS[layout](array)

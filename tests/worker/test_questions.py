@@ -341,7 +341,7 @@ def damaged_bodies(draw):
     return damage(draw(st.sampled_from(valid_bodies)))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(json_values | damaged_bodies())
 def test_any_json_is_a_spec_or_refused(body):
     try:
@@ -357,7 +357,7 @@ def test_any_json_is_a_spec_or_refused(body):
         assert set(found.pointers) == set(found.specs)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=40) | st.text(max_size=40).map(lambda text: text.encode("utf-8", "surrogatepass")))
 def test_any_bytes_are_a_spec_or_refused(body):
     with pytest.raises(SpecError):
