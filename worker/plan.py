@@ -253,9 +253,10 @@ class Planner:
             self._write(node, record.tasks if record else (_task(node),), asked=False)
         parents = [names[parent] for parent in node.parents if parent in names]
         timeout = max(TIMEOUT_FLOOR, round(TIMEOUT_FACTOR * node.cost.seconds))
-        names[node.id] = self._attempts.enqueue(node.id, parents, seconds=node.cost.seconds, timeout=timeout)
+        name = self._attempts.enqueue(node.id, parents, seconds=node.cost.seconds, timeout=timeout)
         if attempt.died:
-            _log.warning("%s: its worker fell silent; it runs again as %s", node.id, names[node.id])
+            _log.warning("%s: its worker fell silent; it runs again as %s", node.id, name)
+        return name
 
     def outdated(self, record: JobRecord) -> None:
         """Record that a task cannot be done any more, since its kind has another version now."""
