@@ -1,208 +1,158 @@
-"""What the systems A_f q = b_f are made of (eqs. 10–12): the tensor W of a target, gradients of a source.
+"""The systems A_f q = b_f of a soft map, laid out for kernels that assemble them for several faces at once.
 
 With c̃_f = (1−ε) c_f + ε ∫β the blend costs nothing: Σⱼ ∫βⱼ μⱼ = 1, so A_f = Σⱼ c̃_fj Wⱼ and u_f = Uᵀ c̃_f.
+Everything of the target is in the order in which its columns are eliminated.
 """
 
 from __future__ import annotations
 
 import weakref
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
 from solver.basis import Basis
-from solver.errors import InvalidBasis, InvalidSoftMap, SolverError
-from solver.fem import hat_gradients
+from solver.cholesky import ENTRIES, FLOATS, INTEGERS, PANELS, Entries, kernel, types
+from solver.errors import SolverError
 from solver.mesh import FloatArray, IntArray
 from solver.softmap import SoftMap
+from solver.symbolic import Panels, Symbolic, analyse
+from solver.tensor import TargetTensor, face_gradients, target_tensor
 
-#: Faces of a target whose products of gradients are held at once (a few MB).
-_TENSOR_FACES = 16384
+#: Entries of A assembled at once, so that one load of c̃ⱼ serves all of them.
+GROUP = 4
 
 
-@dataclass(frozen=True, eq=False)
-class FaceGradients:
-    """Gradients ∇βⱼ|_f of the functions that do not vanish on a face, aligned with `Basis.face_means`.
+class Tensor(NamedTuple):
+    """W in groups of four entries of the lower triangle, chosen so that the same Wⱼ reach them.
 
     Attributes
     ----------
-    indptr : ndarray of int64, shape (F + 1,)
+    start : ndarray of int64, shape (G + 1,)
+        Terms ``start[g]`` to ``start[g + 1]`` make group g.
+    function : ndarray of int64, shape (·,)
+        j of each term.
+    value : ndarray of float64, shape (·, 4)
+        Wⱼ at the group's four entries.
+    row, column : ndarray of int64, shape (4 G,)
+        The entries, group by group; the last group is filled up with zeros at (0, 0).
+    """
+
+    start: IntArray
+    function: IntArray
+    value: FloatArray
+    row: IntArray
+    column: IntArray
+
+
+class Neighbours(NamedTuple):
+    """Both triangles of the pattern, row by row.
+
+    Attributes
+    ----------
+    start : ndarray of int64, shape (n + 1,)
+    column, entry : ndarray of int64, shape (·,)
+        Column of each nonzero, and where it stands among the entries.
+    diagonal : ndarray of int64, shape (n,)
+        Where the diagonal stands among the entries.
+    """
+
+    start: IntArray
+    column: IntArray
+    entry: IntArray
+    diagonal: IntArray
+
+
+class Target(NamedTuple):
+    """All that kernels read of a target basis.
+
+    Attributes
+    ----------
+    panels : Panels
+    entries : Entries
+    tensor : Tensor
+    neighbours : Neighbours
+    integrals : ndarray of float64, shape (1, n)
+        ∫βⱼ.
+    """
+
+    panels: Panels
+    entries: Entries
+    tensor: Tensor
+    neighbours: Neighbours
+    integrals: FloatArray
+
+
+class Source(NamedTuple):
+    """All that kernels read of a source basis and of C.
+
+    Attributes
+    ----------
+    start : ndarray of int64, shape (F₀ + 1,)
         Where each face's functions start.
-    functions : ndarray of int64, shape (nnz,)
-        Which functions live on a face, ascending.
-    means : ndarray of float64, shape (nnz,)
-        Mean of the function on the face.
-    vectors : ndarray of float64, shape (nnz, 3)
-        Its gradient on the unit mesh, in 1 / √area.
+    function : ndarray of int64, shape (nnz,)
+    slope : ndarray of float64, shape (nnz, 3)
+        mean_f(β₀ᵢ) and g_fs[i] = ⟨∇₀β₀ᵢ|_f, V_f^s⟩ for s = 1, 2.
+    coefficients, received : ndarray of float64, shape (n₀, n)
+        C and CU.
     """
 
-    indptr: IntArray
-    functions: IntArray
-    means: FloatArray
-    vectors: FloatArray
+    start: IntArray
+    function: IntArray
+    slope: FloatArray
+    coefficients: FloatArray
+    received: FloatArray
+
+
+TENSOR = types.NamedTuple([INTEGERS, INTEGERS, FLOATS, INTEGERS, INTEGERS], Tensor)
+NEIGHBOURS = types.NamedUniTuple(INTEGERS, len(Neighbours._fields), Neighbours)
+TARGET = types.NamedTuple([PANELS, ENTRIES, TENSOR, NEIGHBOURS, FLOATS], Target)
+SOURCE = types.NamedTuple([INTEGERS, INTEGERS, FLOATS, FLOATS, FLOATS], Source)
 
 
 @dataclass(frozen=True, eq=False)
-class TargetTensor:
-    """W as a sparse matrix: row e holds (Wⱼ[rows[e], columns[e]])ⱼ, for each entry e of the lower pattern.
+class Plan:
+    """What all solves on one target basis share; made once for each basis.
 
     Attributes
     ----------
-    rows, columns : ndarray of int64, shape (E,)
-        Entries on and below the diagonal, in lexicographic order.
-    values : csr_array of float64, shape (E, n)
-        So that ``values @ c`` are the entries of Σⱼ cⱼ Wⱼ.
+    symbolic : Symbolic
+    target : Target
     """
 
-    rows: IntArray
-    columns: IntArray
-    values: sparse.csr_array
-
-
-_tensors: weakref.WeakKeyDictionary[Basis, TargetTensor] = weakref.WeakKeyDictionary()
-
-
-def face_gradients(basis: Basis) -> FaceGradients:
-    """Gradient ∇βⱼ|_f = Σ_corners βⱼ(corner) ∇λ_corner of each function on each face of its support.
-
-    Parameters
-    ----------
-    basis : Basis
-
-    Returns
-    -------
-    FaceGradients
-
-    Raises
-    ------
-    InvalidBasis
-        Never here: the basis was checked when it was made.
-    """
-    means = sparse.csr_array(basis.face_means, copy=True)
-    means.sort_indices()
-    faces_of = np.repeat(np.arange(means.shape[0], dtype=np.int64), np.diff(means.indptr))
-    keys = faces_of * means.shape[1] + means.indices
-    hats = hat_gradients(basis.mesh)
-    vectors = np.zeros((means.nnz, 3))
-    for corner in range(3):
-        values = sparse.coo_array(basis.functions[basis.mesh.faces[:, corner]])
-        place = np.searchsorted(keys, values.row.astype(np.int64) * means.shape[1] + values.col)
-        vectors[place] += values.data[:, None] * hats[values.row, corner]
-    return FaceGradients(means.indptr.astype(np.int64), means.indices.astype(np.int64), means.data, vectors)
-
-
-def target_tensor(basis: Basis) -> TargetTensor:
-    """Tensor Wⱼ[j', k] = ∫ μⱼ ⟨∇βⱼ', ∇βₖ⟩ of a target basis (eq. 11), computed once for each basis.
-
-    Parameters
-    ----------
-    basis : Basis
-
-    Returns
-    -------
-    TargetTensor
-
-    Raises
-    ------
-    InvalidBasis
-        If a function has no support on any face.
-    """
-    tensor = _tensors.get(basis)
-    if tensor is None:
-        tensor = _tensors[basis] = _target_tensor(basis)
-    return tensor
-
-
-def _target_tensor(basis: Basis) -> TargetTensor:
-    gradients = face_gradients(basis)
-    n = basis.size
-    counts = np.diff(gradients.indptr)
-    keys = [np.unique(_pairs(gradients, counts, chunk, n)[1]) for chunk in _chunks(counts)]
-    entries = np.unique(np.concatenate(keys))
-    rows, columns = np.divmod(entries, n)
-    absent = np.setdiff1d(np.arange(n), rows[rows == columns])
-    if absent.size:
-        raise InvalidBasis(f"function {absent[0]} vanishes on every face", index=int(absent[0]))
-    densities = sparse.csr_array(basis.densities)
-    values = sparse.csr_array((entries.size, n))
-    for chunk in _chunks(counts):
-        face, key, product = _pairs(gradients, counts, chunk, n)
-        product *= basis.mesh.face_areas[chunk][face]
-        products = sparse.csr_array(
-            (product, (np.searchsorted(entries, key), face)), shape=(entries.size, chunk.size)
-        )
-        values = values + products @ densities[chunk]
-    values.sort_indices()
-    return TargetTensor(rows, columns, values)
-
-
-def _chunks(counts: IntArray) -> list[IntArray]:
-    """Runs of faces with the same number of functions."""
-    chunks = []
-    for count in np.unique(counts):
-        same = np.flatnonzero(counts == count)
-        chunks += [same[start : start + _TENSOR_FACES] for start in range(0, same.size, _TENSOR_FACES)]
-    return chunks
-
-
-def _pairs(
-    gradients: FaceGradients, counts: IntArray, chunk: IntArray, n: int
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """Pairs of functions on each face of a chunk: place in the chunk, key j'·n + k with j' ≥ k, ⟨∇βⱼ', ∇βₖ⟩."""
-    count = int(counts[chunk[0]])
-    here = gradients.indptr[chunk][:, None] + np.arange(count)
-    functions, vectors = gradients.functions[here], gradients.vectors[here]
-    above, below = np.tril_indices(count)
-    key = functions[:, above] * n + functions[:, below]
-    product = np.einsum("fpx,fpx->fp", vectors[:, above], vectors[:, below])
-    face = np.repeat(np.arange(chunk.size, dtype=np.int64), above.size)
-    return face, key.ravel(), product.ravel()
+    symbolic: Symbolic
+    target: Target
 
 
 @dataclass(frozen=True, eq=False)
-class FaceSystems:
-    """Everything the systems of a soft map's faces are computed from, a few rows at a time.
+class Systems:
+    """The systems of all faces of a soft map, ready for the kernels.
 
     Attributes
     ----------
     softmap : SoftMap
     regularisation : float
-        ε of the blend (1−ε)ρ + ε.
-    tensor : TargetTensor
-        W of the target.
-    means : csr_array of float64, shape (F₀, n₀)
-        mean_f(β₀ᵢ).
-    slopes : tuple of two csr_array of float64, shape (F₀, n₀)
-        g_fs[i] = ⟨∇₀β₀ᵢ|_f, V_f^s⟩ for s = 1, 2.
-    received : ndarray of float64, shape (n₀, n)
-        C U: what u and b are mixed from.
+        ε.
+    plan : Plan
+    source : Source
+    widest : int
+        Most functions on a face of the source.
     """
 
     softmap: SoftMap
     regularisation: float
-    tensor: TargetTensor
-    means: sparse.csr_array
-    slopes: tuple[sparse.csr_array, sparse.csr_array]
-    received: FloatArray
-
-    def weights(self, faces: IntArray | slice) -> FloatArray:
-        """Mixing weights c_f = Cᵀ mean_f(β₀), float64 (len(faces), n); rows sum to 1."""
-        return np.asarray(self.means[faces] @ self.softmap.coefficients)
-
-    def blended(self, weights: FloatArray) -> FloatArray:
-        """Blend c̃_f = (1−ε) c_f + ε ∫β, float64 (len(faces), n)."""
-        return (1 - self.regularisation) * weights + self.regularisation * self.softmap.target.integrals
-
-    def right_sides(self, faces: IntArray | slice) -> FloatArray:
-        """Right-hand sides b_fs = (1−ε) Uᵀ Cᵀ g_fs, float64 (len(faces), 2, n)."""
-        sides = [np.asarray(slope[faces] @ self.received) for slope in self.slopes]
-        right_sides: FloatArray = (1 - self.regularisation) * np.stack(sides, axis=1)
-        return right_sides
+    plan: Plan
+    source: Source
+    widest: int
 
 
-def face_systems(softmap: SoftMap, regularisation: float) -> FaceSystems:
-    """Gather what the systems of a soft map are computed from (eqs. 10–12).
+_plans: weakref.WeakKeyDictionary[Basis, Plan] = weakref.WeakKeyDictionary()
+
+
+def systems(softmap: SoftMap, regularisation: float) -> Systems:
+    """Lay out the systems A_f q_fs = b_fs of a soft map (eqs. 10–12).
 
     Parameters
     ----------
@@ -212,42 +162,156 @@ def face_systems(softmap: SoftMap, regularisation: float) -> FaceSystems:
 
     Returns
     -------
-    FaceSystems
+    Systems
 
     Raises
     ------
     SolverError
         If the regularisation is not strictly between 0 and 1.
-    InvalidSoftMap
-        If the target's mesh is not connected.
+    InvalidBasis
+        If a function of the target vanishes on every face.
     """
     if not 0 < regularisation < 1:
-        raise SolverError(
-            f"the regularisation must be strictly between 0 and 1, not {regularisation}",
-            value=float(regularisation),
-        )
-    target = softmap.target
-    if target.mesh.n_components != 1:
-        raise InvalidSoftMap(
-            f"the target of a soft map must be connected; this one has {target.mesh.n_components} components",
-            value=target.mesh.n_components,
-        )
+        message = f"the regularisation must be strictly between 0 and 1, not {regularisation}"
+        raise SolverError(message, value=float(regularisation))
+    plan = plan_of(softmap.target)
+    order = plan.symbolic.order
     gradients = face_gradients(softmap.source)
-    frames = softmap.source.mesh.frames
-    shape = (softmap.source.mesh.n_faces, softmap.source.size)
-    faces_of = np.repeat(np.arange(shape[0]), np.diff(gradients.indptr))
-    along = np.einsum("ex,esx->es", gradients.vectors, frames[faces_of])
-
-    def aligned(entries: FloatArray) -> sparse.csr_array:
-        return sparse.csr_array(
-            (np.ascontiguousarray(entries), gradients.functions, gradients.indptr), shape=shape
-        )
-
-    return FaceSystems(
-        softmap=softmap,
-        regularisation=float(regularisation),
-        tensor=target_tensor(target),
-        means=aligned(gradients.means),
-        slopes=(aligned(along[:, 0]), aligned(along[:, 1])),
-        received=np.asarray(softmap.coefficients @ target.overlap),
+    counts = np.diff(gradients.start)
+    frames = np.repeat(softmap.source.mesh.frames, counts, axis=0)
+    slopes = np.einsum("esx,ex->es", frames, gradients.vectors)
+    source = Source(
+        start=gradients.start,
+        function=gradients.functions,
+        slope=np.column_stack([gradients.means, slopes]),
+        coefficients=np.ascontiguousarray(softmap.coefficients[:, order]),
+        received=np.ascontiguousarray((softmap.coefficients @ softmap.target.overlap)[:, order]),
     )
+    return Systems(softmap, float(regularisation), plan, source, int(counts.max()))
+
+
+def plan_of(basis: Basis) -> Plan:
+    """Order, panels and tensor of a target basis, made at the first call for it.
+
+    Parameters
+    ----------
+    basis : Basis
+
+    Returns
+    -------
+    Plan
+
+    Raises
+    ------
+    InvalidBasis
+        If a function vanishes on every face.
+    """
+    plan = _plans.get(basis)
+    if plan is None:
+        plan = _plans[basis] = _plan(basis)
+    return plan
+
+
+def _plan(basis: Basis) -> Plan:
+    tensor = target_tensor(basis)
+    pattern = sparse.coo_array(
+        (np.ones(tensor.rows.size), (tensor.rows, tensor.columns)), shape=(basis.size,) * 2
+    )
+    symbolic = analyse(sparse.csr_array(pattern + pattern.T))
+    place = np.argsort(symbolic.order)
+    a, b = place[tensor.rows], place[tensor.columns]
+    grouped, rows, columns = _grouped(tensor, symbolic.order, np.maximum(a, b), np.minimum(a, b))
+    n_entries = tensor.rows.size
+    return Plan(
+        symbolic,
+        Target(
+            panels=symbolic.panels,
+            entries=_entries(symbolic, rows[:n_entries], columns[:n_entries]),
+            tensor=grouped,
+            neighbours=_neighbours(rows[:n_entries], columns[:n_entries], basis.size),
+            integrals=basis.integrals[symbolic.order][None, :].copy(),
+        ),
+    )
+
+
+def _grouped(
+    tensor: TargetTensor, order: IntArray, rows: IntArray, columns: IntArray
+) -> tuple[Tensor, IntArray, IntArray]:
+    """W in groups of entries that share most of their terms; rows and columns in the order of the groups."""
+    values = sparse.csr_array(tensor.values[:, order])
+    values.sort_indices()
+    at = _neighbours(rows, columns, order.size)
+    chosen = _groups(
+        values.indptr.astype(np.int64), values.indices.astype(np.int64), rows, columns, at.start, at.entry
+    )
+    padding = -chosen.size % GROUP
+    group = np.repeat(np.arange((chosen.size + padding) // GROUP), GROUP)[: chosen.size]
+    taken = values[chosen].tocoo()
+    keys = group[taken.row] * order.size + taken.col
+    terms, term = np.unique(keys, return_inverse=True)
+    value = np.zeros((terms.size, GROUP))
+    value[term, taken.row % GROUP] = taken.data
+    of_group, function = np.divmod(terms, order.size)
+    start = np.searchsorted(of_group, np.arange(group[-1] + 2)).astype(np.int64)
+    rows, columns = (np.pad(these[chosen], (0, padding)) for these in (rows, columns))
+    return Tensor(start, function.astype(np.int64), value, rows, columns), rows, columns
+
+
+@kernel(INTEGERS(INTEGERS, INTEGERS, INTEGERS, INTEGERS, INTEGERS, INTEGERS))
+def _groups(start, function, row, column, near_start, near):  # type: ignore[no-untyped-def]
+    """Order of entries in which every four share most terms: each group grows by its cheapest neighbour."""
+    n_entries = row.size
+    chosen = np.empty(n_entries, np.int64)
+    used = np.zeros(n_entries, np.bool_)
+    marked = np.full(near_start.size - 1, -1)
+    n_chosen = 0
+    following = 0
+    for group in range(-(-n_entries // GROUP)):
+        terms = 0
+        seed = -1
+        for _ in range(min(GROUP, n_entries - n_chosen)):
+            best, least = -1, 1 << 62
+            if seed >= 0:
+                for middle in (row[seed], column[seed]):
+                    for other in near[near_start[middle] : near_start[middle + 1]]:
+                        if used[other]:
+                            continue
+                        common = 0
+                        for term in range(start[other], start[other + 1]):
+                            common += marked[function[term]] == group
+                        cost = start[other + 1] - start[other] + terms - 2 * common
+                        if cost < least:
+                            best, least = other, cost
+            while best < 0 and used[following]:
+                following += 1
+            if best < 0:
+                best = following
+            if seed < 0:
+                seed = best
+            used[best] = True
+            chosen[n_chosen] = best
+            n_chosen += 1
+            for term in range(start[best], start[best + 1]):
+                terms += marked[function[term]] != group
+                marked[function[term]] = group
+    return chosen
+
+
+def _entries(symbolic: Symbolic, rows: IntArray, columns: IntArray) -> Entries:
+    cells = symbolic.cells(rows, columns)
+    entry = np.argsort(cells)
+    start = np.searchsorted(cells[entry], symbolic.panels.start)
+    return Entries(start.astype(np.int64), entry.astype(np.int64), cells[entry].astype(np.int64))
+
+
+def _neighbours(rows: IntArray, columns: IntArray, n: int) -> Neighbours:
+    below = np.flatnonzero(rows != columns)
+    row = np.concatenate([rows, columns[below]])
+    column = np.concatenate([columns, rows[below]])
+    entry = np.concatenate([np.arange(rows.size), below])
+    sort = np.lexsort((column, row))
+    start = np.searchsorted(row[sort], np.arange(n + 1)).astype(np.int64)
+    on_diagonal = np.flatnonzero(rows == columns)
+    diagonal = np.empty(n, dtype=np.int64)
+    diagonal[rows[on_diagonal]] = on_diagonal
+    return Neighbours(start, column[sort], entry[sort], diagonal)

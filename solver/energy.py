@@ -8,13 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from solver.assembly import FaceSystems, face_systems
+from solver.assembly import systems
+from solver.chunks import solved_chunks
 from solver.errors import SolverError
 from solver.mesh import FloatArray
-from solver.potential import FACE_BLOCK, Solution, solve
+from solver.potential import FACE_BLOCK
 from solver.softmap import SoftMap
-
-_CHUNK = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,21 +132,22 @@ def dirichlet_block(
     n_faces = softmap.source.mesh.n_faces
     if not 0 <= start < stop <= n_faces:
         raise SolverError(f"[{start}, {stop}) is no block of the faces 0 … {n_faces - 1}")
-    systems = face_systems(softmap, regularisation)
-    areas = softmap.source.mesh.face_areas
-    densities, residual = [], 0.0
-    total = np.zeros(softmap.coefficients.shape) if gradient else None
-    for first in range(start, stop, _CHUNK):
-        faces = np.arange(first, min(first + _CHUNK, stop))
-        solution = solve(systems, faces)
-        densities.append(np.einsum("fsk,fsk->f", solution.right_sides, solution.potential))
-        residual = max(residual, solution.residual)
-        if total is not None:
-            total += _gradient(systems, faces, solution)
+    density = np.empty(stop - start)
+    slopes, forms = np.zeros((2, softmap.source.size if gradient else 0, softmap.target.size))
+    residual, done = 0.0, 0
+    solved = systems(softmap, regularisation)
+    for chunk in solved_chunks(solved, np.arange(start, stop), gradient=gradient, threads=threads):
+        density[done : done + chunk.faces.size] = chunk.density
+        done += chunk.faces.size
+        residual = max(residual, chunk.residual)
+        slopes[chunk.functions] += chunk.slopes
+        forms[chunk.functions] += chunk.forms
         if progress is not None:
-            progress((faces[-1] + 1 - start) / (stop - start))
-    density = np.concatenate(densities)
-    return Dirichlet(math.fsum(areas[start:stop] * density), density, total, residual)
+            progress(done / density.size)
+    energy = math.fsum(softmap.source.mesh.face_areas[start:stop] * density)
+    # Prop. 7: D = (1−ε) [ 2 Σ_fs area₀ g_fs (U q_fs)ᵀ − Σ_f area₀ mean_f(β₀) (Σ_s q_fsᵀ Wⱼ q_fs)ⱼ ].
+    descent = (1 - regularisation) * (2 * (softmap.target.overlap @ slopes.T).T - forms) if gradient else None
+    return Dirichlet(energy, density, descent, residual)
 
 
 def gather_dirichlet(blocks: Iterable[Dirichlet]) -> Dirichlet:
@@ -201,17 +201,3 @@ def bijectivity(softmap: SoftMap) -> Bijectivity:
     density = softmap.target.densities @ received
     gradient = 2 * np.outer(softmap.source.integrals, softmap.target.density_products @ received)
     return Bijectivity(math.fsum(softmap.target.mesh.face_areas * density**2), density, gradient)
-
-
-def _gradient(systems: FaceSystems, faces: np.ndarray, solution: Solution) -> FloatArray:
-    """D = (1−ε) [ 2 Σ_fs area₀ g_fs (U q_fs)ᵀ − Σ_f area₀ mean_f(β₀) (Σ_s q_fsᵀ Wⱼ q_fs)ⱼ ] (prop. 7)."""
-    tensor, areas = systems.tensor, systems.softmap.source.mesh.face_areas[faces]
-    q = solution.potential
-    products = np.einsum("fse,fse->fe", q[:, :, tensor.rows], q[:, :, tensor.columns])
-    products[:, tensor.rows != tensor.columns] *= 2
-    forms = (tensor.values.T @ products.T).T
-    total = -(systems.means[faces].T @ (areas[:, None] * forms))
-    for s, slope in enumerate(systems.slopes):
-        total += 2 * (slope[faces].T @ (areas[:, None] * (systems.softmap.target.overlap @ q[:, s].T).T))
-    scaled: FloatArray = (1 - systems.regularisation) * total
-    return scaled

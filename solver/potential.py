@@ -11,19 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import lapack
 
-from solver.assembly import FaceSystems, face_systems
-from solver.errors import SingularSystem, SolverError
+from solver.assembly import systems
+from solver.chunks import solved_chunks
+from solver.errors import SolverError
 from solver.mesh import FloatArray, IntArray
 from solver.softmap import SoftMap
 
 #: Source faces of one block: a shard of a solve, whose sums are added in order. Bits depend on it.
 FACE_BLOCK = 4096
-#: Residual above which a solution is not trusted. Systems of real maps stay below 1e-15.
-RESIDUAL_TOLERANCE = 1e-10
-#: Pivot, relative to its diagonal entry, below which functions are taken to be linearly dependent.
-PIVOT_TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,58 +45,6 @@ class Potential:
         return iter((self.potential, self.frames))
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Systems of a few faces, solved: potential q, right-hand sides b, residual."""
-
-    weights: FloatArray
-    right_sides: FloatArray
-    potential: FloatArray
-    residual: float
-
-
-def solve(systems: FaceSystems, faces: IntArray) -> Solution:
-    """Solve A_f q_fs = b_fs, u_f · q_fs = 0 on some faces."""
-    weights = systems.weights(faces)
-    blended = systems.blended(weights)
-    means = blended @ systems.softmap.target.overlap
-    right = systems.right_sides(faces)
-    right -= right.sum(axis=2, keepdims=True) * (means / means.sum(axis=1, keepdims=True))[:, None]
-    entries = systems.tensor.values @ blended.T
-    rows, columns = systems.tensor.rows, systems.tensor.columns
-    n = blended.shape[1]
-    potential = np.empty_like(right)
-    worst = 0.0
-    for k, face in enumerate(faces):
-        matrix = np.zeros((n, n))
-        matrix[rows, columns] = entries[:, k]
-        matrix[columns, rows] = entries[:, k]
-        grounded = matrix.copy()
-        ground = int(np.argmax(weights[k]))
-        grounded[ground, ground] *= 2
-        factor, info = lapack.dpotrf(grounded, lower=1)
-        pivots = np.diag(factor) ** 2 / np.diag(grounded)
-        if info != 0 or not pivots.min() > PIVOT_TOLERANCE:
-            pivot = (
-                float(pivots[: info - 1 if info else None].min(initial=0.0)) if info else float(pivots.min())
-            )
-            raise SingularSystem(
-                f"the system of face {face} is singular: target functions are linearly dependent",
-                index=int(face),
-                value=pivot,
-            )
-        q = lapack.dpotrs(factor, right[k].T, lower=1)[0].T
-        scale = np.abs(matrix).sum(axis=1).max() * np.abs(q).max(axis=1) + np.abs(right[k]).max(axis=1)
-        residual = np.abs(q @ matrix - right[k]).max(axis=1) / np.where(scale > 0, scale, 1)
-        if not residual.max() <= RESIDUAL_TOLERANCE:
-            raise SingularSystem(
-                f"face {face} has no trustworthy solution", index=int(face), value=float(residual.max())
-            )
-        worst = max(worst, float(residual.max()))
-        potential[k] = q - (q @ means[k] / means[k].sum())[:, None]
-    return Solution(weights, right, potential, worst)
-
-
 def potential(
     softmap: SoftMap,
     regularisation: float = 1e-5,
@@ -120,7 +64,7 @@ def potential(
     threads : int, optional
         Threads that share the work, one by default. The result does not depend on it.
     progress : callable, optional
-        Called with the fraction done; may raise to abort.
+        Called with the fraction done, by this thread; may raise to abort.
 
     Returns
     -------
@@ -136,10 +80,15 @@ def potential(
     """
     mesh = softmap.source.mesh
     chosen = np.arange(mesh.n_faces) if faces is None else _checked_faces(faces, mesh.n_faces)
-    solution = solve(face_systems(softmap, regularisation), chosen)
-    if progress is not None:
-        progress(1.0)
-    return Potential(solution.potential, mesh.frames[chosen], solution.residual)
+    found = np.empty((chosen.size, 2, softmap.target.size))
+    residual, done = 0.0, 0
+    for chunk in solved_chunks(systems(softmap, regularisation), chosen, potential=True, threads=threads):
+        found[done : done + chunk.faces.size] = chunk.potential
+        done += chunk.faces.size
+        residual = max(residual, chunk.residual)
+        if progress is not None:
+            progress(done / chosen.size)
+    return Potential(found, mesh.frames[chosen], residual)
 
 
 def potential_block(
