@@ -273,7 +273,8 @@ def _groups(start, function, row, column, near_start, near):  # type: ignore[no-
             best, least = -1, 1 << 62
             if seed >= 0:
                 for middle in (row[seed], column[seed]):
-                    for other in near[near_start[middle] : near_start[middle + 1]]:
+                    for k in range(near_start[middle], near_start[middle + 1]):
+                        other = near[k]
                         if used[other]:
                             continue
                         common = 0

@@ -143,17 +143,19 @@ def bench(systems: Systems) -> Bench:
 @kernel(types.int64(SOURCE, INTEGERS, types.int64, FLOATS, SLOTS))
 def _gather(source, faces, first, weights, slots):  # type: ignore[no-untyped-def]
     """Functions of a batch of faces, ascending, and their weights; the last face fills spare lanes."""
-    count = 0
+    count, active = 0, slots.active
     for lane in range(LANES):
         face = faces[min(first + lane, faces.size - 1)]
         for k in range(source.start[face], source.start[face + 1]):
             function = source.function[k]
             if slots.of[function] < 0:
                 slots.of[function] = 0
-                slots.active[count] = function
+                slot = count
+                while slot > 0 and active[slot - 1] > function:
+                    active[slot] = active[slot - 1]
+                    slot -= 1
+                active[slot] = function
                 count += 1
-    active = slots.active[:count]
-    active.sort()
     for slot in range(count):
         slots.of[active[slot]] = slot
     for row in range(3 * count):
@@ -312,21 +314,6 @@ def _accumulate(source, work, lane, face, at, area, gradient):  # type: ignore[n
             forms[j] += mean * form[j]
 
 
-@kernel(types.void(TARGET, SOURCE, BENCH, INTEGERS, types.int64, types.float64))
-def _solve_batch(target, source, bench, faces, first, regularisation):  # type: ignore[no-untyped-def]
-    """Solve the systems of ``faces[first : first + LANES]``."""
-    work, factor, slots = bench
-    count = _gather(source, faces, first, work.weights, slots)
-    _mix(source, target.integrals, regularisation, count, slots.active, work)
-    _project(work.means, work.right)
-    _assemble(target, work)
-    factor_lanes(target.panels, target.entries, work.matrix, work.diagonal, factor)
-    for row in range(len(work.x)):
-        store(work.x, row, load(work.right, row))
-    solve_lanes(target.panels, factor, work.x)
-    _measure(target, work)
-
-
 @kernel(types.void(TARGET, SOURCE, BENCH, INTEGERS, types.float64, FLOATS, INTEGERS, POTENTIAL, GRADIENT))
 def solve_faces(  # type: ignore[no-untyped-def]
     target, source, bench, faces, regularisation, results, order, potential, gradient
@@ -352,9 +339,17 @@ def solve_faces(  # type: ignore[no-untyped-def]
         Sums to which the faces are added, or empty ones.
     """
     at = 0
-    work, factor, _ = bench
+    work, factor, slots = bench
     for first in range(0, faces.size, LANES):
-        _solve_batch(target, source, bench, faces, first, regularisation)
+        count = _gather(source, faces, first, work.weights, slots)
+        _mix(source, target.integrals, regularisation, count, slots.active, work)
+        _project(work.means, work.right)
+        _assemble(target, work)
+        factor_lanes(target.panels, target.entries, work.matrix, work.diagonal, factor)
+        for row in range(len(work.x)):
+            store(work.x, row, load(work.right, row))
+        solve_lanes(target.panels, factor, work.x)
+        _measure(target, work)
         if gradient.line.size > 0:
             _quadratic_forms(target, work)
         for lane in range(min(LANES, faces.size - first)):
