@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import log2
 from typing import Final
 
 from worker import specs
@@ -121,18 +120,23 @@ class Sizes:
 
 
 def basis_cost(spec: specs.Basis, sizes: Sizes) -> Cost:
-    """Samples by fast marching, then one small sparse solve a function."""
+    """Samples by fast marching, then a sparse solve a function on its share of the mesh."""
     n_vertices = sizes.mesh(spec.mesh).n_vertices
-    seconds = 0.02 + 6e-6 * n_vertices * log2(2 + spec.size) + 2.5e-4 * spec.size
+    solves = 1.9e-6 * n_vertices**1.5 / spec.size**0.5
+    seconds = 0.03 + 1.5e-5 * n_vertices + 4e-4 * spec.size + solves
     return Cost(seconds, 3_000 * n_vertices + 20_000 * spec.size)
 
 
 def spectrum_cost(spec: specs.Spectrum, sizes: Sizes) -> Cost:
-    """Lanczos iterations on a sparse factorisation."""
+    """Lanczos iterations on a sparse factorisation, or all eigenpairs where half of them are wanted."""
     n_vertices = sizes.mesh(spec.mesh).n_vertices
     pairs = min(spec.eigenpairs, n_vertices)
-    seconds = 0.05 + 5e-9 * n_vertices * pairs**2 + 2e-6 * n_vertices * pairs
-    return Cost(seconds, _FLOAT * n_vertices * (3 * pairs + 200))
+    seconds = 0.05 + 6e-7 * n_vertices**1.25 * pairs
+    memory = _FLOAT * n_vertices * (6 * pairs + 250)
+    if 2 * pairs > n_vertices:
+        seconds += 1e-9 * n_vertices**3
+        memory += 3 * _FLOAT * n_vertices**2
+    return Cost(seconds, memory)
 
 
 def descriptor_cost(spec: specs.Descriptor, sizes: Sizes) -> Cost:
@@ -151,8 +155,8 @@ def softmap_cost(spec: specs.SoftMap, sizes: Sizes) -> Cost:
     memory = 4 * _FLOAT * entries + 2_000 * (source.mesh.n_vertices + target.mesh.n_vertices)
     if isinstance(spec.map, specs.Descriptors):
         _, columns = sizes.descriptor(spec.map.source)
-        seconds += (4e-9 + 1e-10 * columns) * source.mesh.n_vertices * target.mesh.n_vertices
-        memory += _FLOAT * columns * (source.mesh.n_vertices + target.mesh.n_vertices) + 100_000_000
+        seconds += (1e-8 + 2e-10 * columns) * source.mesh.n_vertices * target.mesh.n_vertices
+        memory += _FLOAT * columns * (source.mesh.n_vertices + target.mesh.n_vertices) + 400_000_000
     if isinstance(spec.map, specs.Mixture):
         seconds += 4e-9 * entries * len(spec.map.maps)
         memory += _FLOAT * entries * len(spec.map.maps)
@@ -162,8 +166,8 @@ def softmap_cost(spec: specs.SoftMap, sizes: Sizes) -> Cost:
 def solve_seconds(size: MapSize, n_faces: int) -> float:
     """Time of the solve for some source faces: assembly, a factorisation and two substitutions each."""
     n = size.target.n_functions
-    setup = 0.05 + 1e-5 * (size.source.mesh.n_faces + size.target.mesh.n_faces)
-    return setup + n_faces * (4e-5 + 4e-7 * n + 6e-9 * n**2 + 2.5e-11 * n**3)
+    setup = 0.05 + 2e-5 * (size.source.mesh.n_faces + size.target.mesh.n_faces)
+    return setup + n_faces * (1e-5 + 1.9e-6 * n + 4.2e-11 * n**3)
 
 
 def solve_bytes(size: MapSize, n_faces: int) -> int:
@@ -188,7 +192,10 @@ def energy_cost(spec: specs.Energy, sizes: Sizes) -> Cost:
 def _energy(size: MapSize, n_faces: int, gradient: bool) -> Cost:
     entries = size.source.n_functions * size.target.n_functions
     memory = solve_bytes(size, n_faces) + _FLOAT * entries * (5 if gradient else 2)
-    return Cost(solve_seconds(size, n_faces) * (1.5 if gradient else 1.0), memory)
+    seconds = solve_seconds(size, n_faces)
+    if gradient:
+        seconds += n_faces * (5e-5 + 2.2e-6 * size.target.n_functions)
+    return Cost(seconds, memory)
 
 
 def potential_block_cost(spec: specs.PotentialBlock, sizes: Sizes) -> Cost:
@@ -206,7 +213,9 @@ def _potential(size: MapSize, n_faces: int) -> Cost:
     row = 2 * size.target.n_functions + 6
     # Solved, then written block by block: 30 ns a number covers hashing and the disk.
     seconds = solve_seconds(size, n_faces) + 3e-8 * row * n_faces
-    return Cost(seconds, solve_bytes(size, n_faces) + 2 * _FLOAT * row * n_faces)
+    # A block's solutions are held with all they were made of.
+    block = min(n_faces, FACE_BLOCK) * 26 * size.target.n_functions
+    return Cost(seconds, solve_bytes(size, n_faces) + _FLOAT * (2 * row * n_faces + block))
 
 
 def gathering_cost(size: MapSize, n_faces: int, gradient: bool) -> Cost:

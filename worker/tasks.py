@@ -99,6 +99,11 @@ class Workplace:
 
         versions()
 
+    def close(self) -> None:
+        """Close the connections to Redis."""
+        self.connection.close()
+        self._notes.close()
+
     def dismissed(self, task: str) -> bool:
         """Whether a task was dismissed."""
         try:

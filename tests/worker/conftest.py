@@ -23,6 +23,7 @@ from worker.questions import parse
 from worker.queue import Dispatcher, Job
 from worker.settings import Settings
 from worker.store import Store
+from worker.tasks import Workplace
 
 #: Between two passes, as the API does it.
 RECONCILE_SECONDS = 3.0
@@ -50,7 +51,7 @@ def ask(dispatcher: Dispatcher, **spec: Any) -> Job:
 
 
 def energy(mesh: str, size: int, **fields: Any) -> dict[str, Any]:
-    """Spec of the identity's energy on a mesh, all parents inline; fields of the map's type are under `map`."""
+    """Spec of the energy of a map from a mesh to itself, all parents inline; uniform unless `map` says more."""
     basis = {"kind": "basis", "mesh": mesh, "size": size}
     inner = fields.pop("map", {"type": "uniform"})
     softmap = {"kind": "softmap", "source": basis, "target": basis, "map": inner}
@@ -193,3 +194,17 @@ def reconciling(dispatcher: Dispatcher) -> Iterator[None]:
     yield
     over.set()
     thread.join()
+
+
+@pytest.fixture
+def place(settings: Settings, store: Store) -> Iterator[Workplace]:
+    """A workplace in this very process, for tests that need no worker."""
+    here = Workplace(settings)
+    yield here
+    here.close()
+
+
+def run(place: Workplace, job: Job) -> None:
+    """Run a job's tasks here and now, parents first."""
+    for task in job.tasks:
+        place.run(task.id)
