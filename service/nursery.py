@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import importlib
+import importlib.util
 import json
 import logging
 import os
@@ -68,10 +69,21 @@ def main() -> None:
     """Serve the owner, whose socket has the descriptor in the first argument, until it hangs up."""
     channel = socket.socket(fileno=int(sys.argv[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the owner hangs up when it is told to stop
+    _bypass_door("solver")
     # All imports that a child needs are made once, here.
     for module in ("trimesh", "solver.mesh", *(f"service.parsing.{name}" for name in FORMATS)):
         importlib.import_module(module)
     _serve(channel)
+
+
+def _bypass_door(package: str) -> None:
+    """Let modules of a package be imported without its door.
+
+    Only the mesh is wanted of the solver; its door would load all kernels, and compile them on a first run.
+    """
+    found = importlib.util.find_spec(package)
+    assert found is not None, "it is part of this project"
+    sys.modules.setdefault(package, importlib.util.module_from_spec(found))
 
 
 def _serve(channel: socket.socket) -> None:
