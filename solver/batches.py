@@ -358,7 +358,9 @@ def solve_faces(  # type: ignore[no-untyped-def]
             results[k, 0] = work.summary[DENSITY, lane]
             results[k, 1] = work.summary[RESIDUAL, lane]
             results[k, 2] = column
-            results[k, 3] = factor.failed[1, lane] / work.diagonal[column, lane] if column >= 0 else 1.0
+            results[k, 3] = factor.failed[1, lane]
+            if column >= 0 and work.diagonal[column, lane] != 0:
+                results[k, 3] /= work.diagonal[column, lane]
             if potential.size > 0:
                 for j in range(order.size):
                     potential[k, 0, order[j]] = work.x[2 * j, lane]

@@ -113,13 +113,14 @@ def solved_chunks(
 
 def _solved(systems: Systems, faces: IntArray, room: Bench, *, potential: bool, gradient: bool) -> Chunk:
     order = systems.plan.symbolic.order
-    results = np.empty((faces.size, 4))
-    found = np.empty((faces.size if potential else 0, 2, order.size))
+    results = np.zeros((faces.size, 4))
+    found = np.zeros((faces.size if potential else 0, 2, order.size))
     functions, sums = _sums(systems, faces if gradient else faces[:0])
-    solve_faces(
-        systems.plan.target, systems.source, room, faces, systems.regularisation, results, order, found, sums
-    )
-    _refuse_untrustworthy(systems, faces, results)
+    # One function spans the constants alone: A is 0, and so is q.
+    if order.size > 1:
+        epsilon = systems.regularisation
+        solve_faces(systems.plan.target, systems.source, room, faces, epsilon, results, order, found, sums)
+        _refuse_untrustworthy(systems, faces, results)
     by_function = np.argsort(order)
     return Chunk(
         faces=faces,
@@ -145,8 +146,7 @@ def _sums(systems: Systems, faces: IntArray) -> tuple[IntArray, Gradient]:
 
 def _refuse_untrustworthy(systems: Systems, faces: IntArray, results: FloatArray) -> None:
     """Raise for the first face with a dependent column or a residual that is large or not a number."""
-    # One function spans the constants alone: its pivot is 0, and the potential is 0.
-    dependent = (results[:, 2] >= 0) & (systems.softmap.target.size > 1)
+    dependent = results[:, 2] >= 0
     bad = np.flatnonzero(dependent | ~(results[:, 1] <= RESIDUAL_TOLERANCE))
     if not bad.size:
         return

@@ -39,7 +39,7 @@ class Lanes(types.Type):
     """The numba type of one entry of ``LANES`` faces."""
 
     def __init__(self) -> None:
-        super().__init__(name=f"Lanes({LANES})")  # type: ignore[no-untyped-call]
+        super().__init__(name=f"Lanes({LANES})")
 
 
 @register_model(Lanes)
@@ -47,7 +47,7 @@ class _LanesModel(models.PrimitiveModel):
     """A vector register."""
 
     def __init__(self, dmm: Any, fe_type: Any) -> None:
-        super().__init__(dmm, fe_type, _VECTOR)
+        super().__init__(dmm, fe_type, _VECTOR)  # type: ignore[no-untyped-call]
 
 
 lanes = Lanes()
