@@ -21,8 +21,10 @@ from solver.mesh import FloatArray, IntArray, Mesh
 #: that symmetric meshes give the same samples whichever way they are turned, and far below any geometry.
 TIE = 1e-6
 
-#: A front lowers a distance only by more than this relative amount: rounding must not lower it for ever.
-PROGRESS = 1e-13
+#: A front passes a vertex again when it has found a way shorter by this relative amount, 1.1 times as much
+#: each time. Obtuse triangles need it a few times. Where triangles are too coarse for the surface, their
+#: planes can contradict each other, and the front would go round them for ever: it ends after 194 times.
+SHORTER, SHORTER_GROWTH = 1e-8, 1.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +145,7 @@ def _checked_first(mesh: Mesh, size: int, first: int | list[int] | IntArray) -> 
 
 
 Surface = tuple[IntArray, IntArray, IntArray, FloatArray, FloatArray, FloatArray]
-Scratch = tuple[FloatArray, IntArray, IntArray, IntArray]
+Scratch = tuple[FloatArray, IntArray, IntArray, IntArray, IntArray]
 
 
 def _surface(mesh: Mesh) -> Surface:
@@ -158,14 +160,14 @@ def _surface(mesh: Mesh) -> Surface:
 
 
 def _scratch(n_vertices: int) -> Scratch:
-    """Distances of a moving front, the vertices it touched, its heap, and each vertex's place in that."""
-    nowhere = np.full(n_vertices, -1, dtype=np.int64)
-    return np.full(n_vertices, np.inf), nowhere, nowhere.copy(), nowhere.copy()
+    """Distances of a moving front, vertices it touched, times it passed each, its heap and places in that."""
+    touched, passed, heap = np.zeros((3, n_vertices), dtype=np.int64)
+    return np.full(n_vertices, np.inf), touched, passed, heap, np.full(n_vertices, -1, dtype=np.int64)
 
 
 _kernel = partial(numba.njit, cache=True, nogil=True)
 _SURFACE = "int64[::1], int64[::1], int64[:, ::1], float64[:, ::1], float64[::1], float64[::1]"
-_SCRATCH = "float64[::1], int64[::1], int64[::1], int64[::1]"
+_SCRATCH = "float64[::1], int64[::1], int64[::1], int64[::1], int64[::1]"
 
 
 @_kernel("float64(float64, float64, float64, float64, float64, float64)")
@@ -173,8 +175,8 @@ def _across(d_a: float, d_b: float, ab: float, ac: float, bc: float, doubled_are
     """Distance at C of the front with distances d_a at A and d_b at B, where it crosses AB; else inf.
 
     In the plane of the face, A = (0, 0), B = (ab, 0) and C above them, the front comes from the point below
-    them at distances d_a and d_b. It grows with d_a and d_b, so lowering distances until none is lowered any
-    more ends in the same field in whatever order that is done.
+    them at distances d_a and d_b. It grows with d_a and d_b, so lowering distances as far as they go ends in
+    the same field in whatever order that is done.
     """
     source_x = 0.5 * ((d_a - d_b) * ((d_a + d_b) / ab) + ab)
     squared = (d_a - source_x) * (d_a + source_x)
@@ -243,6 +245,7 @@ def _march(
     bound: FloatArray,
     distance: FloatArray,
     touched: IntArray,
+    passed: IntArray,
     heap: IntArray,
     place: IntArray,
 ) -> int:
@@ -259,6 +262,7 @@ def _march(
     while size > 0:
         v = _pop(distance, heap, place, size)
         size -= 1
+        passed[v] += 1
         if distance[v] >= bound[v] + reach[v]:
             continue
         for slot in range(starts[v], starts[v + 1]):
@@ -272,12 +276,15 @@ def _march(
                 reached = d_v + vw
                 if d_other < math.inf:
                     reached = min(reached, _across(d_v, d_other, v_other, vw, w_other, doubled_areas[f]))
-                if reached < distance[w] * (1.0 - PROGRESS):
+                if reached < distance[w]:
+                    new = place[w] < 0
+                    shorter = SHORTER * SHORTER_GROWTH ** passed[w]
+                    if new and passed[w] > 0 and reached > distance[w] * (1.0 - shorter):
+                        continue
                     if distance[w] == math.inf:
                         touched[n_touched] = w
                         n_touched += 1
                     distance[w] = reached
-                    new = place[w] < 0
                     _rise(w, distance, heap, place, size)
                     if new:
                         size += 1
@@ -298,12 +305,25 @@ def _claim(
     cells: IntArray,
     distance: FloatArray,
     touched: IntArray,
+    passed: IntArray,
     heap: IntArray,
     place: IntArray,
 ) -> None:
     """Give a new sample the vertices that are nearer to it than to any before it, and clear the front."""
     n_touched = _march(
-        source, starts, corners, faces, lengths, doubled_areas, reach, nearest, distance, touched, heap, place
+        source,
+        starts,
+        corners,
+        faces,
+        lengths,
+        doubled_areas,
+        reach,
+        nearest,
+        distance,
+        touched,
+        passed,
+        heap,
+        place,
     )
     for v in touched[:n_touched]:
         if distance[v] < nearest[v]:
@@ -311,6 +331,7 @@ def _claim(
                 cells[v] = label
             nearest[v] = distance[v]
         distance[v] = math.inf
+        passed[v] = 0
 
 
 @_kernel("int64(float64[::1])")

@@ -15,7 +15,7 @@ from scipy.sparse import csgraph
 from scipy.spatial import Delaunay
 
 from solver.errors import InvalidBasis, InvalidMesh
-from solver.geodesics import TIE, distances_from, farthest_point_samples
+from solver.geodesics import SHORTER, TIE, distances_from, farthest_point_samples
 from solver.mesh import Mesh
 from tests.solver import shapes
 
@@ -88,6 +88,20 @@ def test_on_spheres_distances_converge() -> None:
     assert slope > 0.8
 
 
+def test_fronts_end_even_among_triangles_that_contradict_each_other() -> None:
+    # Sizes from 1e-8 to 1e8 in one tangle: without an end, fronts went round the tiny ones for ever.
+    rng = np.random.default_rng(361)
+    size = int(rng.integers(4, 60))
+    vertices = rng.normal(size=(size, 3)) * 10.0 ** rng.uniform(-8, 8, size=(size, 1))
+    faces = rng.integers(0, size, size=(2 * size, 3))
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    longest = np.max([np.linalg.norm(e, axis=1) for e in (a - b, b - c, c - a)], axis=0)
+    mesh = Mesh(vertices, faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-13 * longest**2])
+    for vertex in np.flatnonzero(mesh.referenced):
+        distances = distances_from(mesh, vertex)
+        assert (distances <= along_edges(mesh, vertex) + 1e-12).all()
+
+
 @pytest.mark.parametrize("make", [shapes.icosphere, shapes.torus, lambda: shapes.grid(20, 20)])
 def test_the_heat_method_agrees(make: Callable[[], Mesh]) -> None:
     mesh = make()
@@ -114,7 +128,7 @@ def test_samples_and_cells_are_those_of_complete_fronts(make: Callable[[], Mesh]
             ties = np.flatnonzero(nearest >= nearest.max() * (1 - TIE))
             assert vertex == ties[0]
         nearest = np.minimum(nearest, distances_from(mesh, vertex))
-    np.testing.assert_allclose(samples.distances, nearest, rtol=1e-12)
+    np.testing.assert_allclose(samples.distances, nearest, rtol=10 * SHORTER)
     own = np.array([distances_from(mesh, vertex) for vertex in samples.vertices])
     at_cell = own[samples.cells, np.arange(mesh.n_vertices)]
     np.testing.assert_allclose(at_cell, nearest, rtol=3 * TIE, atol=1e-15)
@@ -125,7 +139,7 @@ def test_on_real_meshes_stopped_fronts_lose_nothing(source: str, data: Path) -> 
     mesh = shapes.load(data / "robust" / source)
     samples = farthest_point_samples(mesh, 60)
     nearest = np.min([distances_from(mesh, vertex) for vertex in samples.vertices], axis=0)
-    np.testing.assert_allclose(samples.distances, nearest, rtol=1e-12)
+    np.testing.assert_allclose(samples.distances, nearest, rtol=10 * SHORTER)
 
 
 def test_tied_corners_of_a_square_are_taken_in_order() -> None:
