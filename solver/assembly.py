@@ -75,7 +75,7 @@ class Target(NamedTuple):
     tensor : Tensor
     neighbours : Neighbours
     integrals : ndarray of float64, shape (1, n)
-        ∫βⱼ.
+        ∫βⱼ; here, in C and in CU, n is rounded up to an even number by a column of zeros.
     """
 
     panels: Panels
@@ -184,8 +184,8 @@ def systems(softmap: SoftMap, regularisation: float) -> Systems:
         start=gradients.start,
         function=gradients.functions,
         slope=np.column_stack([gradients.means, slopes]),
-        coefficients=np.ascontiguousarray(softmap.coefficients[:, order]),
-        received=np.ascontiguousarray((softmap.coefficients @ softmap.target.overlap)[:, order]),
+        coefficients=_even(softmap.coefficients[:, order]),
+        received=_even((softmap.coefficients @ softmap.target.overlap)[:, order]),
     )
     return Systems(softmap, float(regularisation), plan, source, int(counts.max()))
 
@@ -229,9 +229,14 @@ def _plan(basis: Basis) -> Plan:
             entries=_entries(symbolic, rows[:n_entries], columns[:n_entries]),
             tensor=grouped,
             neighbours=_neighbours(rows[:n_entries], columns[:n_entries], basis.size),
-            integrals=basis.integrals[symbolic.order][None, :].copy(),
+            integrals=_even(basis.integrals[symbolic.order][None, :]),
         ),
     )
+
+
+def _even(columns: FloatArray) -> FloatArray:
+    """An array with a zero column more if their number is odd: kernels take them two by two."""
+    return np.ascontiguousarray(np.pad(columns, [(0, 0), (0, columns.shape[1] % 2)]))
 
 
 def _grouped(

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from solver.assembly import SOURCE, TARGET, Systems
+from solver.assembly import NEIGHBOURS, SOURCE, TARGET, TENSOR, Systems
 from solver.cholesky import FACTOR, FLOATS, INTEGERS, Factor, factor_lanes, kernel, solve_lanes, types
 from solver.lanes import (
     LANES,
@@ -21,13 +21,19 @@ from solver.lanes import (
     empty_lanes,
     larger,
     load,
+    load_four,
     multiply,
     splat,
     store,
+    store_four,
+    subtract,
     subtract_product,
     where_above,
 )
 from solver.mesh import FloatArray, IntArray
+
+#: Groups of lanes that make a batch: A is assembled for all at once, and solved for one after the other.
+GROUPS = 4
 
 
 class Work(NamedTuple):
@@ -35,29 +41,31 @@ class Work(NamedTuple):
 
     Attributes
     ----------
-    matrix : (4 G, LANES)
-        Entries of A, in the order of the tensor's groups.
+    matrix : (GROUPS · 4 G, LANES)
+        Entries of A in the order of the tensor's groups, for one group of lanes after the other.
+    blended : (GROUPS · n, LANES)
+        c̃, the groups of lanes side by side.
+    forms : (GROUPS · n, LANES)
+        Σ_s q_sᵀ Wⱼ q_s, likewise.
+    means : (GROUPS · n, LANES)
+        u = Uᵀc̃, one group of lanes after the other.
+    right, x : (GROUPS · 2n, LANES)
+        b and q likewise, the two directions side by side.
     diagonal : (n, LANES)
         Diagonal of A, doubled where a face is grounded.
-    blended, means : (n, LANES)
-        c̃ and u = Uᵀc̃.
-    right, x : (2n, LANES)
-        b and q, the two directions side by side.
-    forms : (n, LANES)
-        Σ_s q_sᵀ Wⱼ q_s.
     weights : (3 m, LANES)
-        Mean and slopes of each of the m functions that live on the batch's faces.
-    summary : (3, LANES)
+        Mean and slopes of each of the m functions that live on some faces.
+    summary : (GROUPS · 3, LANES)
         Heaviest function, energy density, residual.
     """
 
     matrix: FloatArray
-    diagonal: FloatArray
     blended: FloatArray
+    forms: FloatArray
     means: FloatArray
     right: FloatArray
     x: FloatArray
-    forms: FloatArray
+    diagonal: FloatArray
     weights: FloatArray
     summary: FloatArray
 
@@ -132,9 +140,9 @@ def bench(systems: Systems) -> Bench:
     target = systems.plan.target
     n = target.integrals.size
     active = min(len(systems.source.coefficients), LANES * systems.widest)
-    sizes = Work(target.tensor.row.size, n, n, n, 2 * n, 2 * n, n, 3 * active, 3)  # type: ignore[arg-type]
+    sizes = [GROUPS * target.tensor.row.size, *[GROUPS * n] * 3, *[GROUPS * 2 * n] * 2, n, 3 * active]
     return Bench(
-        Work(*(empty_lanes(size) for size in sizes)),  # type: ignore[arg-type]
+        Work(*(empty_lanes(size) for size in sizes), empty_lanes(3 * GROUPS)),
         Factor(empty_lanes(int(target.panels.start[-1])), empty_lanes(n), empty_lanes(2)),
         Slots(np.full(len(systems.source.coefficients), -1), np.empty(active, dtype=np.int64)),
     )
@@ -171,28 +179,43 @@ def _gather(source, faces, first, weights, slots):  # type: ignore[no-untyped-de
     return count
 
 
-@kernel(types.void(SOURCE, FLOATS, types.float64, types.int64, INTEGERS, WORK))
-def _mix(source, integrals, regularisation, count, active, work):  # type: ignore[no-untyped-def]
+@kernel(types.void(SOURCE, FLOATS, types.float64, types.int64, INTEGERS, WORK, types.int64))
+def _mix(source, integrals, regularisation, count, active, work, group):  # type: ignore[no-untyped-def]
     """c̃ = (1−ε) Cᵀ mean(β₀) + ε ∫β, u = (1−ε) (CU)ᵀ mean(β₀) + ε ∫β, b_s = (1−ε) (CU)ᵀ g_s, argmax c."""
+    n = integrals.shape[1]
     keep = splat(1 - regularisation)
     heaviest, most = splat(0.0), splat(-1.0)
-    for j in range(integrals.shape[1]):
+    for j in range(0, n, 2):
         c, u, b0, b1 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
+        d, v, e0, e1 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
         for k in range(count):
-            mean = load(work.weights, 3 * k)
-            received = splat(source.received[active[k], j])
-            c = add_product(splat(source.coefficients[active[k], j]), mean, c)
-            u = add_product(received, mean, u)
-            b0 = add_product(received, load(work.weights, 3 * k + 1), b0)
-            b1 = add_product(received, load(work.weights, 3 * k + 2), b1)
+            mean, slope = load(work.weights, 3 * k), load(work.weights, 3 * k + 1)
+            slope1 = load(work.weights, 3 * k + 2)
+            row = source.coefficients[active[k]]
+            c, d = add_product(splat(row[j]), mean, c), add_product(splat(row[j + 1]), mean, d)
+            row = source.received[active[k]]
+            weight = splat(row[j])
+            u = add_product(weight, mean, u)
+            b0, b1 = add_product(weight, slope, b0), add_product(weight, slope1, b1)
+            weight = splat(row[j + 1])
+            v = add_product(weight, mean, v)
+            e0, e1 = add_product(weight, slope, e0), add_product(weight, slope1, e1)
         heaviest = where_above(c, most, splat(float(j)), heaviest)
         most = where_above(c, most, c, most)
+        heaviest = where_above(d, most, splat(float(j + 1)), heaviest)
+        most = where_above(d, most, d, most)
+        row = group * n + j
         spread = splat(regularisation * integrals[0, j])
-        store(work.blended, j, add_product(keep, c, spread))
-        store(work.means, j, add_product(keep, u, spread))
-        store(work.right, 2 * j, multiply(keep, b0))
-        store(work.right, 2 * j + 1, multiply(keep, b1))
-    store(work.summary, HEAVIEST, heaviest)
+        store(work.blended, GROUPS * j + group, add_product(keep, c, spread))
+        store(work.means, row, add_product(keep, u, spread))
+        store(work.right, 2 * row, multiply(keep, b0))
+        store(work.right, 2 * row + 1, multiply(keep, b1))
+        spread = splat(regularisation * integrals[0, j + 1])
+        store(work.blended, GROUPS * (j + 1) + group, add_product(keep, d, spread))
+        store(work.means, row + 1, add_product(keep, v, spread))
+        store(work.right, 2 * row + 2, multiply(keep, e0))
+        store(work.right, 2 * row + 3, multiply(keep, e1))
+    store(work.summary, 3 * group + HEAVIEST, heaviest)
 
 
 @kernel(types.void(FLOATS, FLOATS))
@@ -210,108 +233,159 @@ def _project(means, right):  # type: ignore[no-untyped-def]
         store(right, 2 * k + 1, subtract_product(u, second, load(right, 2 * k + 1)))
 
 
-@kernel(types.void(TARGET, WORK))
-def _assemble(target, work):  # type: ignore[no-untyped-def]
-    """A = Σⱼ c̃ⱼ Wⱼ, its diagonal doubled at the heaviest function."""
-    start, function, value, _, _ = target.tensor
+@kernel(types.void(TENSOR, FLOATS, FLOATS))
+def _assemble(tensor, blended, matrix):  # type: ignore[no-untyped-def]
+    """A = Σⱼ c̃ⱼ Wⱼ for all four groups of lanes, so that W is read once for them."""
+    start, function, value, rows, _ = tensor
+    n = rows.size
     for group in range(start.size - 1):
-        a, b, c, d = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
+        a0, a1, a2, a3 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
+        b0, b1, b2, b3 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
+        c0, c1, c2, c3 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
+        d0, d1, d2, d3 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
         for k in range(start[group], start[group + 1]):
-            weight = load(work.blended, function[k])
-            a = add_product(splat(value[k, 0]), weight, a)
-            b = add_product(splat(value[k, 1]), weight, b)
-            c = add_product(splat(value[k, 2]), weight, c)
-            d = add_product(splat(value[k, 3]), weight, d)
-        store(work.matrix, 4 * group, a)
-        store(work.matrix, 4 * group + 1, b)
-        store(work.matrix, 4 * group + 2, c)
-        store(work.matrix, 4 * group + 3, d)
-    for k in range(len(work.diagonal)):
-        store(work.diagonal, k, load(work.matrix, target.neighbours.diagonal[k]))
+            row = 4 * function[k]
+            w0, w1, w2, w3 = load_four(blended, row)
+            entry = splat(value[k, 0])
+            a0, a1 = add_product(entry, w0, a0), add_product(entry, w1, a1)
+            a2, a3 = add_product(entry, w2, a2), add_product(entry, w3, a3)
+            entry = splat(value[k, 1])
+            b0, b1 = add_product(entry, w0, b0), add_product(entry, w1, b1)
+            b2, b3 = add_product(entry, w2, b2), add_product(entry, w3, b3)
+            entry = splat(value[k, 2])
+            c0, c1 = add_product(entry, w0, c0), add_product(entry, w1, c1)
+            c2, c3 = add_product(entry, w2, c2), add_product(entry, w3, c3)
+            entry = splat(value[k, 3])
+            d0, d1 = add_product(entry, w0, d0), add_product(entry, w1, d1)
+            d2, d3 = add_product(entry, w2, d2), add_product(entry, w3, d3)
+        row = 4 * group
+        store_four(matrix, row, a0, b0, c0, d0)
+        store_four(matrix, row + n, a1, b1, c1, d1)
+        store_four(matrix, row + 2 * n, a2, b2, c2, d2)
+        store_four(matrix, row + 3 * n, a3, b3, c3, d3)
+
+
+@kernel(types.void(FLOATS, FLOATS, INTEGERS, FLOATS))
+def _ground(summary, matrix, where, diagonal):  # type: ignore[no-untyped-def]
+    """Diagonal of A, doubled at each face's heaviest function: exact, since 1ᵀb = 0."""
+    for k in range(where.size):
+        store(diagonal, k, load(matrix, where[k]))
     for lane in range(LANES):
-        work.diagonal[int(work.summary[HEAVIEST, lane]), lane] *= 2
+        diagonal[int(summary[HEAVIEST, lane]), lane] *= 2
 
 
-@kernel(types.void(TARGET, WORK))
-def _measure(target, work):  # type: ignore[no-untyped-def]
-    """Shift q so that u · q = 0; density Σ_s b_s · q_s and residual ‖Aq−b‖∞ / (‖A‖∞‖q‖∞ + ‖b‖∞)."""
+@kernel(types.void(FLOATS, FLOATS))
+def _shift(means, x):  # type: ignore[no-untyped-def]
+    """Shift q so that u · q = 0."""
     total, first, second = splat(0.0), splat(0.0), splat(0.0)
-    for k in range(len(work.means)):
-        u = load(work.means, k)
+    for k in range(len(means)):
+        u = load(means, k)
         total = add(total, u)
-        first = add_product(u, load(work.x, 2 * k), first)
-        second = add_product(u, load(work.x, 2 * k + 1), second)
+        first = add_product(u, load(x, 2 * k), first)
+        second = add_product(u, load(x, 2 * k + 1), second)
     first, second = divide(first, total), divide(second, total)
-    one = splat(1.0)
-    for k in range(len(work.means)):
-        store(work.x, 2 * k, subtract_product(one, first, load(work.x, 2 * k)))
-        store(work.x, 2 * k + 1, subtract_product(one, second, load(work.x, 2 * k + 1)))
-    density, size, worst = splat(0.0), splat(0.0), splat(0.0)
-    q, b, off = splat(0.0), splat(0.0), splat(0.0)
-    q1, b1, off1 = splat(0.0), splat(0.0), splat(0.0)
-    near = target.neighbours
-    for row in range(len(work.means)):
-        right, right1 = load(work.right, 2 * row), load(work.right, 2 * row + 1)
-        x, x1 = load(work.x, 2 * row), load(work.x, 2 * row + 1)
-        density = add_product(right1, x1, add_product(right, x, density))
-        q, q1 = larger(q, absolute(x)), larger(q1, absolute(x1))
-        b, b1 = larger(b, absolute(right)), larger(b1, absolute(right1))
-        line = splat(0.0)
+    for k in range(len(means)):
+        store(x, 2 * k, subtract(load(x, 2 * k), first))
+        store(x, 2 * k + 1, subtract(load(x, 2 * k + 1), second))
+
+
+@kernel(types.void(NEIGHBOURS, FLOATS, FLOATS, FLOATS, FLOATS))
+def _measure(near, matrix, right, x, summary):  # type: ignore[no-untyped-def]
+    """Density Σ_s b_s · q_s, and residual ‖Aq−b‖∞ / (‖A‖∞‖q‖∞ + ‖b‖∞)."""
+    zero = splat(0.0)
+    density, size = zero, zero
+    q0, b0, off0 = zero, zero, zero
+    q1, b1, off1 = zero, zero, zero
+    for row in range(near.diagonal.size):
+        rest0, rest1 = load(right, 2 * row), load(right, 2 * row + 1)
+        own0, own1 = load(x, 2 * row), load(x, 2 * row + 1)
+        density = add_product(rest1, own1, add_product(rest0, own0, density))
+        q0, q1 = larger(q0, absolute(own0)), larger(q1, absolute(own1))
+        b0, b1 = larger(b0, absolute(rest0)), larger(b1, absolute(rest1))
+        line = zero
         for k in range(near.start[row], near.start[row + 1]):
-            entry = load(work.matrix, near.entry[k])
-            column = 2 * near.column[k]
-            right = subtract_product(entry, load(work.x, column), right)
-            right1 = subtract_product(entry, load(work.x, column + 1), right1)
+            entry, column = load(matrix, near.entry[k]), 2 * near.column[k]
+            rest0 = subtract_product(entry, load(x, column), rest0)
+            rest1 = subtract_product(entry, load(x, column + 1), rest1)
             line = add(line, absolute(entry))
         size = larger(size, line)
-        off, off1 = larger(off, absolute(right)), larger(off1, absolute(right1))
-    scale, scale1 = add_product(size, q, b), add_product(size, q1, b1)
-    zero = splat(0.0)
-    worst = where_above(scale, zero, divide(off, scale), off)
+        off0, off1 = larger(off0, absolute(rest0)), larger(off1, absolute(rest1))
+    scale0, scale1 = add_product(size, q0, b0), add_product(size, q1, b1)
+    worst = where_above(scale0, zero, divide(off0, scale0), off0)
     worst = larger(worst, where_above(scale1, zero, divide(off1, scale1), off1))
-    store(work.summary, DENSITY, density)
-    store(work.summary, RESIDUAL, worst)
+    store(summary, DENSITY, density)
+    store(summary, RESIDUAL, worst)
 
 
-@kernel(types.void(TARGET, WORK))
-def _quadratic_forms(target, work):  # type: ignore[no-untyped-def]
-    """Σ_s q_sᵀ Wⱼ q_s for every j: the transpose of the assembly, applied to products of q."""
-    start, function, value, rows, columns = target.tensor
-    for entry in range(rows.size):
-        row, column = 2 * rows[entry], 2 * columns[entry]
-        product = multiply(load(work.x, row), load(work.x, column))
-        product = add_product(load(work.x, row + 1), load(work.x, column + 1), product)
-        store(work.matrix, entry, product if row == column else add(product, product))
-    for j in range(len(work.forms)):
-        store(work.forms, j, splat(0.0))
+@kernel(types.void(TENSOR, FLOATS, FLOATS))
+def _multiply(tensor, x, products):  # type: ignore[no-untyped-def]
+    """Products Σ_s q_s[row] q_s[column] of every entry, doubled off the diagonal."""
+    for entry in range(tensor.row.size):
+        row, column = 2 * tensor.row[entry], 2 * tensor.column[entry]
+        product = multiply(load(x, row), load(x, column))
+        product = add_product(load(x, row + 1), load(x, column + 1), product)
+        store(products, entry, product if row == column else add(product, product))
+
+
+@kernel(types.void(TENSOR, FLOATS, FLOATS))
+def _quadratic_forms(tensor, products, forms):  # type: ignore[no-untyped-def]
+    """Σ_s q_sᵀ Wⱼ q_s for every j: the transpose of the assembly, for all four groups of lanes."""
+    start, function, value, rows, _ = tensor
+    n = rows.size
+    for row in range(len(forms)):
+        store(forms, row, splat(0.0))
     for group in range(start.size - 1):
-        a, b = load(work.matrix, 4 * group), load(work.matrix, 4 * group + 1)
-        c, d = load(work.matrix, 4 * group + 2), load(work.matrix, 4 * group + 3)
+        row = 4 * group
+        a0, b0, c0, d0 = load_four(products, row)
+        a1, b1, c1, d1 = load_four(products, row + n)
+        a2, b2, c2, d2 = load_four(products, row + 2 * n)
+        a3, b3, c3, d3 = load_four(products, row + 3 * n)
         for k in range(start[group], start[group + 1]):
-            form = load(work.forms, function[k])
-            form = add_product(splat(value[k, 0]), a, form)
-            form = add_product(splat(value[k, 1]), b, form)
-            form = add_product(splat(value[k, 2]), c, form)
-            form = add_product(splat(value[k, 3]), d, form)
-            store(work.forms, function[k], form)
+            row = 4 * function[k]
+            f0, f1, f2, f3 = load_four(forms, row)
+            entry = splat(value[k, 0])
+            f0, f1 = add_product(entry, a0, f0), add_product(entry, a1, f1)
+            f2, f3 = add_product(entry, a2, f2), add_product(entry, a3, f3)
+            entry = splat(value[k, 1])
+            f0, f1 = add_product(entry, b0, f0), add_product(entry, b1, f1)
+            f2, f3 = add_product(entry, b2, f2), add_product(entry, b3, f3)
+            entry = splat(value[k, 2])
+            f0, f1 = add_product(entry, c0, f0), add_product(entry, c1, f1)
+            f2, f3 = add_product(entry, c2, f2), add_product(entry, c3, f3)
+            entry = splat(value[k, 3])
+            f0, f1 = add_product(entry, d0, f0), add_product(entry, d1, f1)
+            f2, f3 = add_product(entry, d2, f2), add_product(entry, d3, f3)
+            store_four(forms, row, f0, f1, f2, f3)
 
 
-@kernel(types.void(SOURCE, WORK, types.int64, types.int64, types.int64, types.float64, GRADIENT))
-def _accumulate(source, work, lane, face, at, area, gradient):  # type: ignore[no-untyped-def]
-    """Add one face to the sums of the gradient."""
-    n = len(work.forms)
+@kernel(types.void(SOURCE, FLOATS, FLOATS, types.int64, types.int64, types.int64, types.float64, GRADIENT))
+def _accumulate(source, x, forms, lane, face, at, area, gradient):  # type: ignore[no-untyped-def]
+    """Add one face to the sums of the gradient; `forms` starts at the face's group of lanes."""
+    n = gradient.slopes.shape[1]
     first, second, form = np.empty(n), np.empty(n), np.empty(n)
     for k in range(n):
-        first[k] = area * work.x[2 * k, lane]
-        second[k] = area * work.x[2 * k + 1, lane]
-        form[k] = area * work.forms[k, lane]
+        first[k] = area * x[2 * k, lane]
+        second[k] = area * x[2 * k + 1, lane]
+        form[k] = area * forms[GROUPS * k, lane]
     for k in range(source.start[face], source.start[face + 1]):
         line = gradient.line[at + k - source.start[face]]
         mean, slope, slope1 = source.slope[k, 0], source.slope[k, 1], source.slope[k, 2]
-        slopes, forms = gradient.slopes[line], gradient.forms[line]
+        slopes, sums = gradient.slopes[line], gradient.forms[line]
         for j in range(n):
             slopes[j] += slope * first[j] + slope1 * second[j]
-            forms[j] += mean * form[j]
+            sums[j] += mean * form[j]
+
+
+@kernel(types.void(FLOATS, FLOATS, FLOATS, types.int64, types.int64, FLOATS))
+def _report(summary, failed, diagonal, first, count, results):  # type: ignore[no-untyped-def]
+    """Density, residual, last dependent column or −1 and its relative pivot, a line for each face."""
+    for lane in range(count):
+        column = int(failed[0, lane])
+        result = results[first + lane]
+        result[0], result[1], result[2] = summary[DENSITY, lane], summary[RESIDUAL, lane], column
+        result[3] = failed[1, lane]
+        if column >= 0 and diagonal[column, lane] != 0:
+            result[3] /= diagonal[column, lane]
 
 
 @kernel(types.void(TARGET, SOURCE, BENCH, INTEGERS, types.float64, FLOATS, INTEGERS, POTENTIAL, GRADIENT))
@@ -338,33 +412,45 @@ def solve_faces(  # type: ignore[no-untyped-def]
     gradient : Gradient
         Sums to which the faces are added, or empty ones.
     """
-    at = 0
     work, factor, slots = bench
-    for first in range(0, faces.size, LANES):
-        count = _gather(source, faces, first, work.weights, slots)
-        _mix(source, target.integrals, regularisation, count, slots.active, work)
-        _project(work.means, work.right)
-        _assemble(target, work)
-        factor_lanes(target.panels, target.entries, work.matrix, work.diagonal, factor)
-        for row in range(len(work.x)):
-            store(work.x, row, load(work.right, row))
-        solve_lanes(target.panels, factor, work.x)
-        _measure(target, work)
-        if gradient.line.size > 0:
-            _quadratic_forms(target, work)
-        for lane in range(min(LANES, faces.size - first)):
-            k = first + lane
-            column = int(factor.failed[0, lane])
-            results[k, 0] = work.summary[DENSITY, lane]
-            results[k, 1] = work.summary[RESIDUAL, lane]
-            results[k, 2] = column
-            results[k, 3] = factor.failed[1, lane]
-            if column >= 0 and work.diagonal[column, lane] != 0:
-                results[k, 3] /= work.diagonal[column, lane]
-            if potential.size > 0:
-                for j in range(order.size):
-                    potential[k, 0, order[j]] = work.x[2 * j, lane]
-                    potential[k, 1, order[j]] = work.x[2 * j + 1, lane]
+    n, n_entries = target.integrals.size, target.tensor.row.size
+    at = 0
+    for begin in range(0, faces.size, GROUPS * LANES):
+        for group in range(GROUPS):
+            count = _gather(source, faces, begin + group * LANES, work.weights, slots)
+            _mix(source, target.integrals, regularisation, count, slots.active, work, group)
+        _assemble(target.tensor, work.blended, work.matrix)
+        for group in range(GROUPS):
+            first = begin + group * LANES
+            if first >= faces.size:
+                break
+            count = min(LANES, faces.size - first)
+            matrix = work.matrix[group * n_entries : (group + 1) * n_entries]
+            means = work.means[group * n : (group + 1) * n]
+            right = work.right[group * 2 * n : (group + 1) * 2 * n]
+            x = work.x[group * 2 * n : (group + 1) * 2 * n]
+            summary = work.summary[3 * group : 3 * group + 3]
+            _ground(summary, matrix, target.neighbours.diagonal, work.diagonal)
+            factor_lanes(target.panels, target.entries, matrix, work.diagonal, factor)
+            _project(means, right)
+            for row in range(len(x)):
+                store(x, row, load(right, row))
+            solve_lanes(target.panels, factor, x)
+            _shift(means, x)
+            _measure(target.neighbours, matrix, right, x, summary)
+            _report(summary, factor.failed, work.diagonal, first, count, results)
             if gradient.line.size > 0:
-                _accumulate(source, work, lane, faces[k], at, gradient.area[0, k], gradient)
-                at += source.start[faces[k] + 1] - source.start[faces[k]]
+                _multiply(target.tensor, x, matrix)
+            if potential.size > 0:
+                for lane in range(count):
+                    for j in range(order.size):
+                        potential[first + lane, 0, order[j]] = x[2 * j, lane]
+                        potential[first + lane, 1, order[j]] = x[2 * j + 1, lane]
+        if gradient.line.size == 0:
+            continue
+        _quadratic_forms(target.tensor, work.matrix, work.forms)
+        for k in range(begin, min(begin + GROUPS * LANES, faces.size)):
+            group, lane = divmod(k - begin, LANES)
+            x = work.x[group * 2 * n : (group + 1) * 2 * n]
+            _accumulate(source, x, work.forms[group:], lane, faces[k], at, gradient.area[0, k], gradient)
+            at += source.start[faces[k] + 1] - source.start[faces[k]]

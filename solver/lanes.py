@@ -129,6 +129,32 @@ def store(_: Any, array: Any, index: Any, value: Any) -> Any:
 
 
 @intrinsic
+def load_four(_: Any, array: Any, index: Any) -> Any:
+    """Four rows of an array of lanes from `index` on."""
+    kind = types.UniTuple(lanes, 4)
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        rows = _rows(context, builder, signature.args[0], args[0])
+        places = [_row(builder, rows, builder.add(args[1], _INT64(k))) for k in range(4)]
+        return context.make_tuple(builder, kind, [builder.load(place, align=8) for place in places])
+
+    return kind(array, types.int64), emit
+
+
+@intrinsic
+def store_four(_: Any, array: Any, index: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """Set four rows of an array of lanes from `index` on."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        rows = _rows(context, builder, signature.args[0], args[0])
+        for k in range(4):
+            builder.store(args[2 + k], _row(builder, rows, builder.add(args[1], _INT64(k))), align=8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, *[lanes] * 4), emit
+
+
+@intrinsic
 def splat(_: Any, scalar: Any) -> Any:
     """One number in every lane."""
 
