@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Self
 
@@ -88,6 +88,11 @@ class Job:
         fields = {name: document[name] for name in cls.__dataclass_fields__ if name != "tasks"}
         tasks = tuple(Task(task["id"], task["kind"], task["status"]) for task in document["tasks"])
         return cls(**fields, tasks=tasks)
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The job as JSON would hold it."""
+        return asdict(self)
 
     @property
     def finished(self) -> bool:

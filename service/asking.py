@@ -10,6 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from service.refusals import Unusable
+
 #: Maps that need no numbers.
 NAMED_MAPS = ("wks", "hks", "uniform")
 
@@ -60,11 +62,11 @@ def named_map(name: str, sigma: float | None = None) -> dict[str, Any]:
 
     Raises
     ------
-    ValueError
+    Unusable
         If there is no such map.
     """
     if name not in NAMED_MAPS:
-        raise ValueError(f"{name!r} is no map; the names are {', '.join(NAMED_MAPS)}")
+        raise Unusable(f"{name!r} is no map; the names are {', '.join(NAMED_MAPS)}")
     if name == "uniform":
         return {"type": "uniform"}
     fields = {"type": "descriptors", "descriptor": name}
@@ -88,36 +90,34 @@ def map_kind(array: NDArray[Any], n_source: int, n_target: int) -> Literal["poin
 
     Raises
     ------
-    ValueError
+    Unusable
         If it is neither beyond doubt; says why.
     """
     if array.dtype.kind not in "iuf":
-        raise ValueError(f"a map is made of numbers, not of {array.dtype}")
+        raise Unusable(f"a map is made of numbers, not of {array.dtype}")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ValueError(f"number {_first(~np.isfinite(array))} of the map is not finite")
+        raise Unusable(f"number {_first(~np.isfinite(array))} of the map is not finite")
     if array.ndim == 2 and array.shape[1] > 1:
         return "matrix"
     if array.ndim not in {1, 2}:
-        raise ValueError(f"a map has one or two axes, not the shape {array.shape}")
+        raise Unusable(f"a map has one or two axes, not the shape {array.shape}")
     flat = array.ravel()
     if len(flat) != n_source:
-        raise ValueError(
-            f"the map has {len(flat)} entries, but the source has {n_source} vertices (the target {n_target}); "
+        raise Unusable(
+            f"the map has {len(flat)} entries, the source {n_source} vertices, the target {n_target}; "
             "a point map names the target vertex of every source vertex"
         )
     if array.dtype.kind == "f":
-        raise ValueError("a point map holds whole numbers, written without a decimal point")
+        raise Unusable("a point map holds whole numbers, written without a decimal point")
     if flat.min() < 0:
         at = _first(flat < 0)
-        raise ValueError(
-            f"entry {at} of the map is {flat[at]}; every source vertex needs a target, from 0 on"
-        )
+        raise Unusable(f"entry {at} of the map is {flat[at]}; every source vertex needs a target, from 0 on")
     if flat.max() >= n_target:
         at = _first(flat >= n_target)
         hint = (
             "; the map seems to count from 1: subtract 1" if (flat.min(), flat.max()) == (1, n_target) else ""
         )
-        raise ValueError(
+        raise Unusable(
             f"entry {at} of the map is {flat[at]}, but the target's vertices are 0 to {n_target - 1}{hint}"
         )
     return "points"
@@ -138,7 +138,7 @@ def read_map(path: Path) -> NDArray[Any]:
 
     Raises
     ------
-    ValueError
+    Unusable
         If it is neither; says why.
     OSError
         If it cannot be read.
@@ -148,10 +148,10 @@ def read_map(path: Path) -> NDArray[Any]:
         try:
             array: NDArray[Any] = np.load(path, allow_pickle=False)
         except (ValueError, EOFError) as error:
-            raise ValueError(f"{path} is no .npy file of numbers: {error}") from None
+            raise Unusable(f"{path} is no .npy file of numbers: {error}") from None
         return array
     if ending != ".txt":
-        raise ValueError(
+        raise Unusable(
             f"{path}: maps are read from .txt and .npy; formats such as .map and .vts differ in where they "
             "count from, so write down the target of every source vertex, counted from 0"
         )
@@ -161,17 +161,17 @@ def read_map(path: Path) -> NDArray[Any]:
         if line.strip()
     ]
     if not rows:
-        raise ValueError(f"{path} is empty")
+        raise Unusable(f"{path} is empty")
     for number, row in enumerate(rows, start=1):
         if len(row) != len(rows[0]):
-            raise ValueError(f"{path}: row {number} has {len(row)} numbers, the first has {len(rows[0])}")
+            raise Unusable(f"{path}: row {number} has {len(row)} numbers, the first has {len(rows[0])}")
     for convert, kind in ((int, np.int64), (float, np.float64)):
         try:
             table = np.array([[convert(word) for word in row] for row in rows], dtype=kind)
         except (ValueError, OverflowError):
             continue
         return table[:, 0] if table.shape[1] == 1 else table
-    raise ValueError(f"{path} holds something that is no number")
+    raise Unusable(f"{path} holds something that is no number")
 
 
 def _first(where: NDArray[np.bool_]) -> int:

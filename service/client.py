@@ -30,7 +30,7 @@ class Client(Session):
 
     Raises
     ------
-    ValueError
+    Unusable
         If the address is none.
     """
 
@@ -78,10 +78,10 @@ class Client(Session):
         ------
         ClientError
             `Invalid`, `JobFailed`, `WaitedTooLong` and others; see ``service.refusals``.
-        ValueError
+        Unusable
             If the map fits neither the vertices nor a matrix.
         """
-        m0, m = self._mesh(source), self._mesh(target)
+        m0, m = self.mesh(source), self.mesh(target)
         options = BasisOptions(size=size, cutoff=cutoff)
         spec = {
             "kind": "energy",
@@ -113,7 +113,7 @@ class Client(Session):
 
         Raises
         ------
-        ValueError
+        Unusable
             If it is no map between these meshes; says why.
         ClientError
             If the numbers cannot be uploaded.
@@ -170,7 +170,24 @@ class Client(Session):
         visit(id)
         return list(found.values())
 
-    def _mesh(self, mesh: MeshLike) -> Upload:
+    def mesh(self, mesh: MeshLike) -> Upload:
+        """Upload a mesh, or look up one that was uploaded.
+
+        Parameters
+        ----------
+        mesh : path, bytes, (vertices, faces) or mesh id
+            As in `energy`.
+
+        Returns
+        -------
+        Upload
+            Its id and facts.
+
+        Raises
+        ------
+        ClientError
+            As `upload_mesh`; `NotFound` for an unknown id.
+        """
         if isinstance(mesh, str) and _MESH_ID.fullmatch(mesh):
             return Upload(mesh, self.artifact(mesh).values)
         return self.upload_mesh(mesh)

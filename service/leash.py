@@ -1,9 +1,9 @@
 """A command that ends when its supervisor ends, however that happens: ``leash.py PARENT FOLDER COMMAND…``.
 
 Run as a script by its path, with nothing but the standard library, so that it is up in a few milliseconds.
-Without a folder (``-``) it becomes the command, and the kernel kills that when the supervisor is gone. With one
-it stays as the command's parent, lets it end in peace, and removes the folder, which nobody else could do after
-``kill -9`` of the supervisor.
+Without a folder (``-``) it becomes the command, and the kernel kills that when the supervisor is gone. With a
+folder it stays as the command's parent, lets it end in peace, and removes the folder, which nobody else could
+do after ``kill -9`` of the supervisor.
 """
 
 import ctypes

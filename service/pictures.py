@@ -22,11 +22,13 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 #: Percentiles of a density that its colours span: a few extreme faces must not flatten the rest.
-LOWEST, HIGHEST = 2.0, 99.0
+LOWEST, HIGHEST = 4.0, 99.0
 #: A scale is at least this wide, or the rounding of a constant density would look like structure.
 LEAST_RATIO = 1.01
 #: Decades of a logarithmic scale at most; below them a density is as good as zero.
 DECADES = 3.0
+#: Ratio of its ends from which a logarithmic scale has a label a decade.
+WIDE = 100.0
 #: Samples per pixel and direction; edges are smooth because they are averaged.
 OVERSAMPLING = 2
 #: Fragments rasterised at once: a few hundred megabytes at most, whatever the mesh.
@@ -157,7 +159,9 @@ def figure(rows: Sequence[Sequence[Panel]], view: View | None = None) -> Figure:
             )
             bar.set_label(panel.label, fontsize=9)
             if panel.logarithmic:
-                bar.locator = LogLocator(subs=(1.0, 2.0, 5.0))
+                low, high = scale.get_clim()
+                # One label a decade, or three where there are few decades.
+                bar.locator = LogLocator(subs=(1.0,) if high > WIDE * low else (1.0, 2.0, 5.0))
                 bar.formatter = FuncFormatter(lambda value, _position: f"{value:g}")
                 bar.minorticks_off()
                 bar.update_ticks()

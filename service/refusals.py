@@ -1,6 +1,7 @@
 """What can go wrong for a client, one type a cause.
 
 ClientError
+├── Unusable              what the client was given is no map or no address (a ValueError too)
 ├── Unreachable           nobody answers at the address, or the answer breaks off
 │   └── Silence           nothing more came within the time given
 ├── WaitedTooLong         the job is not finished within the client's own patience; carries the job
@@ -29,6 +30,10 @@ if TYPE_CHECKING:
 
 class ClientError(Exception):
     """Anything that a client can expect to go wrong."""
+
+
+class Unusable(ClientError, ValueError):
+    """What the client was given is no map, or no address."""
 
 
 class Unreachable(ClientError):

@@ -41,7 +41,7 @@ class Session:
 
     Raises
     ------
-    ValueError
+    Unusable
         If the address is none.
     """
 

@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import IO, Self
 
 import httpx
+import redis
 from pydantic import SecretStr
 
 from service.embedded import EmbeddedRedis
@@ -26,6 +27,8 @@ START_SECONDS = 300.0
 HOPELESS_DEATHS = 3
 #: Longest that workers, then the API, may take to end before they are killed.
 STOP_SECONDS = 10.0
+#: Longest that a Redis which the settings name may take to answer.
+REDIS_SECONDS = 5.0
 #: Seconds between two looks at the children.
 LOOK_SECONDS = 0.1
 
@@ -157,6 +160,8 @@ class Stack:
             if self._settings.redis_url is None:
                 self._report("starting Redis")
                 server = EmbeddedRedis(self._settings.redis_folder)
+            else:
+                _check_redis(self._settings.redis_url)
             environment = self._environment(server.url if server else str(self._settings.redis_url))
             self._watch(server, environment)
         except (RuntimeError, OSError) as error:
@@ -271,6 +276,16 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def _check_redis(url: str) -> None:
+    try:
+        with redis.Redis.from_url(
+            url, socket_timeout=REDIS_SECONDS, socket_connect_timeout=REDIS_SECONDS
+        ) as client:
+            client.ping()
+    except (redis.exceptions.RedisError, ValueError) as error:
+        raise RuntimeError(f"SOFTMAPS_REDIS_URL: {error}") from None
 
 
 def _locked(data: Path) -> IO[str]:

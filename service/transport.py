@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 
 import httpx
 
-from service.refusals import Silence, Unreachable, refusal
+from service.refusals import Silence, Unreachable, Unusable, refusal
 
 #: Statuses that mean "later"; the service says when in Retry-After.
 LATER = frozenset({429, 503})
@@ -40,14 +40,14 @@ class Transport:
 
     Raises
     ------
-    ValueError
+    Unusable
         If the address is none.
     """
 
     def __init__(self, url: str, token: str | None, patience: float) -> None:
         parts = urlsplit(url)
         if parts.scheme not in {"http", "https"} or not parts.hostname:
-            raise ValueError(f"{url!r} is no address of a service; say http://host:port")
+            raise Unusable(f"{url!r} is no address of a service; say http://host:port")
         self.url = url.rstrip("/")
         self._patience = patience
         self._http = httpx.Client(

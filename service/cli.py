@@ -1,0 +1,37 @@
+"""The command `softmaps`: every command's name, and what it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import typer
+
+from service.answering import basis, energy, potential, softmap
+from service.demo import demo
+from service.operating import api, jobs, up, worker
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help="Soft maps between triangle meshes: their Dirichlet and bijectivity energies, as a service.",
+)
+COMMANDS: Mapping[str, Callable[..., None]] = {
+    "up": up,
+    "demo": demo,
+    "energy": energy,
+    "basis": basis,
+    "map": softmap,
+    "potential": potential,
+    "jobs": jobs,
+    "worker": worker,
+    "api": api,
+}
+for name, command in COMMANDS.items():
+    app.command(name)(command)
+
+
+def main() -> None:
+    """Run the command line; what ``softmaps`` and ``python -m service`` call."""
+    app(prog_name="softmaps")
