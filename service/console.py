@@ -224,10 +224,14 @@ def settings_in_words(screen: Screen, **fields: Any) -> Settings:
 
 
 def interrupt_on_termination() -> None:
-    """Let SIGTERM and a closed terminal end a command as Ctrl-C does, with everything cleaned up."""
+    """Let SIGTERM and a closed terminal end a command as Ctrl-C does: once, with everything cleaned up."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
     def interrupt(number: int, frame: FrameType | None) -> None:
+        # Whoever presses it again must not interrupt the cleaning up, which ends soon enough.
+        for each in numbers:
+            signal.signal(each, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in numbers:
         signal.signal(number, interrupt)

@@ -33,7 +33,7 @@ from service.options import Json
 from service.stack import Stack
 
 EXPLANATION = (
-    "The wave kernel signature cannot tell one leg from another: it spreads a paw over all four, and where "
+    "The wave kernel signature cannot tell one leg from another: it spreads a shin over all four, and where "
     "the shares change, mass has to cross surface that carries none: there the Dirichlet density is high. "
     "The true map is a point map, whose density is about 2 where it is an isometry."
 )

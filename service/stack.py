@@ -62,6 +62,8 @@ class Stack:
     ----------
     url : str
         Address of the API.
+    settings : Settings
+        As given.
     workers, threads : int
         Workers for everything, and threads of each.
 
@@ -84,7 +86,7 @@ class Stack:
         cores = available_cores()
         self.workers = workers or max(1, cores // 4)
         self.threads = settings.threads or max(1, cores // self.workers)
-        self._settings, self._public, self._report = settings, public, report
+        self.settings, self._public, self._report = settings, public, report
         self._endpoint = settings.data / "endpoint"
         self._lock = _locked(settings.data)
         try:
@@ -157,12 +159,12 @@ class Stack:
     def _run(self) -> None:
         server: EmbeddedRedis | None = None
         try:
-            if self._settings.redis_url is None:
+            if self.settings.redis_url is None:
                 self._report("starting Redis")
-                server = EmbeddedRedis(self._settings.redis_folder)
+                server = EmbeddedRedis(self.settings.redis_folder)
             else:
-                _check_redis(self._settings.redis_url)
-            environment = self._environment(server.url if server else str(self._settings.redis_url))
+                _check_redis(self.settings.redis_url)
+            environment = self._environment(server.url if server else str(self.settings.redis_url))
             self._watch(server, environment)
         except (RuntimeError, OSError) as error:
             self._failure = self._failure or str(error)
@@ -175,7 +177,7 @@ class Stack:
             self._settled.set()
 
     def _watch(self, server: EmbeddedRedis | None, environment: dict[str, str]) -> None:
-        logs = self._settings.data / "logs"
+        logs = self.settings.data / "logs"
         logs.mkdir(parents=True, exist_ok=True)
         self._report("starting the API and a worker")
         fd = self._listener.fileno()
@@ -216,7 +218,7 @@ class Stack:
                     f"{child.name} does not start; the end of {child.log}:\n{child.last_words()}"
                 )
         if seconds > START_SECONDS:
-            logs = self._settings.data / "logs"
+            logs = self.settings.data / "logs"
             raise RuntimeError(f"the stack was not ready after {seconds:.0f} s; its logs are in {logs}")
 
     def _publish(self) -> None:
@@ -237,7 +239,7 @@ class Stack:
     def _environment(self, redis_url: str) -> dict[str, str]:
         """Environment of the children: these settings, whatever they came from."""
         environment = {name: value for name, value in os.environ.items() if not name.startswith("SOFTMAPS_")}
-        settings = self._settings.model_dump(exclude_none=True) | {
+        settings = self.settings.model_dump(exclude_none=True) | {
             "redis_url": redis_url,
             "threads": self.threads,
         }
