@@ -192,6 +192,7 @@ def _metric_lines(app: FastAPI) -> list[str]:
     lines: list[str] = app.state.metrics.lines()
     usage = rooms.store.usage()
     lines += gauges({"store_bytes": usage.bytes, "store_artifacts": usage.artifacts})
+    lines += gauges({"waiting_requests": rooms.watch.waiting})
     try:
         lines += gauges({"redis_up": 1, **rooms.dispatcher.metrics()})
     except redis.exceptions.RedisError:

@@ -145,6 +145,11 @@ def completed(document: dict[str, Any]) -> dict[str, Any]:
         "description": "A question. Wherever it holds the id of a computed kind, that spec may stand inline, "
         "and wherever it holds the id of an array, a list of numbers may.",
     }
+    for operations in document["paths"].values():
+        for operation in operations.values():
+            # FastAPI adds its own kind of 422 wherever there is a parameter; ours is another.
+            if "422" in operation["responses"]:
+                operation["responses"]["422"] = problems(422)[422]
     for name in ("HTTPValidationError", "ValidationError"):
         schemas.pop(name, None)
     components["securitySchemes"] = {"bearer": {"type": "http", "scheme": "bearer"}}

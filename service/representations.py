@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import re
 import zipfile
 from collections.abc import AsyncIterator, Iterator
@@ -31,8 +32,10 @@ CACHE_PUBLIC = "public, max-age=31536000, immutable"
 CACHE_PRIVATE = "private, max-age=31536000, immutable"
 #: Bytes handed to the network at once: a slow reader holds no more.
 _PIECE = 256 * 2**10
+#: Numbers read at once: about a block of the store, which is verified whole each time.
+_JSON_READ = 2**20
 #: Numbers written as JSON at once; the interpreter serves nobody else meanwhile.
-_JSON_NUMBERS = 10_000
+_JSON_WRITTEN = 10_000
 Bytes = bytes | memoryview
 _ROWS = re.compile(r"(-?[0-9]{1,18})?:(-?[0-9]{1,18})?")
 _RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
@@ -252,17 +255,18 @@ def _bytes(
 
 def _json_rows(store: Store, manifest: Manifest, name: str, rows: Rows) -> Iterator[bytes]:
     """Nested lists, some rows at a time; what is not finite becomes null."""
-    numbers = int(np.prod(rows.shape[1:]))
-    step = max(1, _JSON_NUMBERS // max(1, numbers))
+    row = max(1, math.prod(rows.shape[1:]))
+    read, written = max(1, _JSON_READ // row), max(1, _JSON_WRITTEN // row)
     separator = b"["
-    for start in range(rows.start, rows.stop, step):
-        part = store.array(manifest, name, start, min(rows.stop, start + step))
-        values: Any = part
-        if part.dtype.kind == "f" and not np.isfinite(part).all():
-            values = part.astype(object)
-            values[~np.isfinite(part)] = None
-        yield separator + json.dumps(values.tolist(), separators=(",", ":"), allow_nan=False)[1:-1].encode()
-        separator = b","
+    for start in range(rows.start, rows.stop, read):
+        block = store.array(manifest, name, start, min(rows.stop, start + read))
+        for first in range(0, len(block), written):
+            values: Any = block[first : first + written]
+            if values.dtype.kind == "f" and not (finite := np.isfinite(values)).all():
+                values = np.where(finite, values.astype(object), None)
+            text = json.dumps(values.tolist(), separators=(",", ":"), allow_nan=False)
+            yield separator + text[1:-1].encode()
+            separator = b","
     yield b"]" if separator == b"," else b"[]"
 
 

@@ -68,7 +68,11 @@ async def upload_mesh(request: Request, rooms: InRooms, name: Name = None) -> Re
             values = {"name": name, "format": file_format, **mesh.facts}
             upload = _Upload(id_, "mesh", values, arrays, began)
             manifest, status = await asyncio.to_thread(_stored, rooms.store, upload)
-    return JSONResponse(mesh_reply(manifest).model_dump(), status, {"Location": f"/v1/artifacts/{id_}"})
+    # The same mesh may have come before in another file: what is said is about this one.
+    reply = mesh_reply(manifest).model_copy(
+        update={"format": file_format, "warnings": mesh.facts["warnings"]}
+    )
+    return JSONResponse(reply.model_dump(), status, {"Location": f"/v1/artifacts/{id_}"})
 
 
 @router.post(

@@ -183,6 +183,11 @@ class Nursery:
         self._waiting: dict[int, asyncio.Future[str]] = {}
         self._number = 0
 
+    @property
+    def pid(self) -> int | None:
+        """Process id, None while there is none."""
+        return self._process.pid if self._process is not None else None
+
     async def start(self) -> None:
         """Start the process; it goes on importing after this returns, and orders wait for it."""
         ours, theirs = socket.socketpair()

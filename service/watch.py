@@ -40,6 +40,11 @@ class Watch:
         self._looked = asyncio.Condition()
         self._poller: asyncio.Task[None] | None = None
 
+    @property
+    def waiting(self) -> int:
+        """How many wait."""
+        return self._watchers.total()
+
     async def stop(self) -> None:
         """End the poller; who still waits is left to be cancelled."""
         if self._poller is not None:

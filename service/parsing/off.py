@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Iterator
 
 import numpy as np
 
 from service.parsing.polygons import InvalidFile, Limits, Polygons
-from service.parsing.text import floats, ints, lines
+from service.parsing.text import lines, refuse_underscores, wrong_number
 
 _KEYWORD = re.compile(rb"(ST)?(C)?(N)?(4)?(n)?OFF")
 
@@ -27,6 +26,7 @@ def read(content: bytes, limits: Limits) -> Polygons:
     TooLarge
         If the header announces more than the limits.
     """
+    refuse_underscores(content, rb"^[^#\n]*_")
     records = _Records(content)
     n_vertices, n_faces = records.counts()
     # The shortest vertex is "0 0 0" and a line end, the shortest face "3 0 1 2" and one.
@@ -36,76 +36,92 @@ def read(content: bytes, limits: Limits) -> Polygons:
             f"the file of {len(content):,} bytes cannot hold them"
         )
     limits.check(n_vertices, n_faces)
-    coordinates, sizes, corners = array("d"), array("q"), array("q")
-    extras: set[int] = set()
-    for k in range(n_vertices):
-        where, words, rest = records.take(3, f"vertex {k}")
-        coordinates.extend(floats(words, where))
-        extras.add(rest)
-    if len(extras) > 1:
-        raise InvalidFile("vertices must all have as many numbers, each vertex on a line of its own")
-    for k in range(n_faces):
-        where, words, rest = records.take(1, f"face {k}", keep=True)
-        (size,) = ints(words, where)
-        if size < 3:
-            raise InvalidFile(f"{where} has {size} corners; a face needs three")
-        where, words, _ = records.take(size, f"face {k}")
-        sizes.append(size)
-        corners.extend(ints(words, where))
+    coordinates, extras = _vertices(records, n_vertices)
+    sizes, corners = _faces(records, n_faces)
     records.finish(n_vertices, n_faces)
-    notes = ("numbers after the three coordinates of each vertex were left out",) if extras - {0} else ()
+    notes = ("numbers after the three coordinates of each vertex were left out",) if extras else ()
     vertices = np.array(coordinates).reshape(-1, 3)
     return Polygons(vertices, np.array(sizes, dtype=np.int64), np.array(corners, dtype=np.int64), notes)
+
+
+def _vertices(records: _Records, count: int) -> tuple[array[float], int]:
+    """Coordinates, and how many numbers follow them on every line."""
+    coordinates = array("d")
+    extras: set[int] = set()
+    for k in range(count):
+        words = records.next(3, "vertex", k)
+        try:
+            coordinates.extend(map(float, words[:3]))
+        except ValueError:
+            raise wrong_number(words[:3], float, records.where("vertex", k)) from None
+        extras.add(len(words) - 3)
+    if len(extras) > 1:
+        raise InvalidFile("vertices must all have as many numbers, each vertex on a line of its own")
+    return coordinates, max(extras, default=0)
+
+
+def _faces(records: _Records, count: int) -> tuple[array[int], array[int]]:
+    """Sizes, and the corners of all polygons one after the other."""
+    sizes, corners = array("q"), array("q")
+    for k in range(count):
+        words = records.next(1, "face", k)
+        try:
+            size = int(words[0])
+            if size < 3:
+                raise InvalidFile(f"{records.where('face', k)} has {size} corners; a face needs three")
+            if len(words) <= size:
+                words = records.longer(words, size + 1, "face", k)
+            corners.extend(map(int, words[1 : size + 1]))
+        except (ValueError, OverflowError):
+            raise wrong_number(words, int, records.where("face", k)) from None
+        sizes.append(size)
+    return sizes, corners
 
 
 class _Records:
     """The words of an OFF file, record by record."""
 
     def __init__(self, content: bytes) -> None:
-        self._lines: Iterator[tuple[int, list[bytes]]] = lines(content)
-        self._words: list[bytes] = []
+        self._lines = lines(content)
         self._number = 0
 
-    def _more(self, what: str) -> None:
-        found = next(self._lines, None)
-        if found is None:
-            raise InvalidFile(f"the file ends before {what}: it is truncated, or its header counts wrongly")
-        self._number, self._words = found
+    def where(self, what: str, k: int) -> str:
+        """Place of the record read last."""
+        return f"line {self._number}, {what} {k}"
+
+    def next(self, count: int, what: str, k: int) -> list[bytes]:
+        """Words of the next line, and of further ones until there are ``count``."""
+        for number, words in self._lines:
+            self._number = number
+            return words if len(words) >= count else self.longer(words, count, what, k)
+        raise InvalidFile(f"the file ends before {what} {k}: it is truncated, or its header counts wrongly")
+
+    def longer(self, words: list[bytes], count: int, what: str, k: int) -> list[bytes]:
+        """Those words and the ones of following lines, until there are ``count``."""
+        while len(words) < count:
+            words = words + self.next(1, what, k)
+        return words
 
     def counts(self) -> tuple[int, int]:
         """Check the keyword and return the announced numbers of vertices and faces."""
-        self._more("its OFF keyword")
-        keyword = _KEYWORD.match(self._words[0])
+        words = self.next(1, "line", 1)
+        keyword = _KEYWORD.match(words[0])
         if keyword is None:
             raise InvalidFile("the file does not begin with the keyword OFF")
         if keyword[4] or keyword[5]:
             raise InvalidFile("only OFF with three coordinates a vertex is supported")
         # Some writers put no space between the keyword and the first count.
-        self._words = [word for word in [self._words[0][keyword.end() :], *self._words[1:]] if word]
-        if [word.upper() for word in self._words[:1]] == [b"BINARY"]:
+        words = [word for word in [words[0][keyword.end() :], *words[1:]] if word]
+        if [word.upper() for word in words[:1]] == [b"BINARY"]:
             raise InvalidFile("binary OFF is not supported: save it as text, or as binary PLY")
-        if not self._words:
-            self._more("its counts")
-        where, words = f"line {self._number}", self._words
-        self._words = []
-        counts = ints(words, where)
+        words = words or self.next(1, "line", 2)
+        try:
+            counts = [int(word) for word in words]
+        except ValueError:
+            raise wrong_number(words, int, f"line {self._number}") from None
         if len(counts) not in {2, 3} or min(counts) < 0:
-            raise InvalidFile(f"{where}: the counts of vertices, faces and edges are expected")
+            raise InvalidFile(f"line {self._number}: the counts of vertices, faces and edges are expected")
         return counts[0], counts[1]
-
-    def take(self, count: int, what: str, *, keep: bool = False) -> tuple[str, list[bytes], int]:
-        """Return the place, ``count`` words, and how many more stood on the line (dropped unless kept)."""
-        taken: list[bytes] = []
-        while len(taken) < count:
-            if not self._words:
-                self._more(what)
-            needed = count - len(taken)
-            taken += self._words[:needed]
-            self._words = self._words[needed:]
-        rest = len(self._words)
-        if not keep:
-            self._words = []
-        return f"line {self._number}, {what}", taken, rest
 
     def finish(self, n_vertices: int, n_faces: int) -> None:
         """Refuse a file that goes on after what its header announces."""

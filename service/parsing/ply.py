@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.parsing.polygons import InvalidFile, Limits, Polygons
-from service.parsing.text import floats, ints, lines
+from service.parsing.text import lines, refuse_underscores, wrong_number
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -261,35 +261,58 @@ class _Text:
     """Rows of a text body, each on its own line; words after the declared properties are dropped."""
 
     def __init__(self, body: bytes) -> None:
+        refuse_underscores(body)
         self._lines = lines(body)
         self.extra_words = False
 
     def rows(self, element: _Element) -> Rows:
-        lengths: dict[str, list[int]] = {prop.name: [] for prop in element.properties}
-        words: dict[str, list[bytes]] = {prop.name: [] for prop in element.properties}
-        lists = any(prop.length_type for prop in element.properties)
-        for row in range(element.count if element.properties else 0):
-            _, line = next(self._lines, (0, None))
-            if line is None:
-                raise _truncated(element)
-            at = 0
-            for prop in element.properties:
-                length = 1
-                if prop.length_type:
-                    length = (ints(line[at : at + 1], f"row {row} of {element.name!r}") or [-1])[0]
-                    at += 1
-                if not 0 <= length <= len(line) - at:
-                    raise InvalidFile(f"row {row} of {element.name!r} has fewer numbers than declared")
-                words[prop.name] += line[at : at + length]
-                if lists:
-                    lengths[prop.name].append(length)
-                at += length
-            self.extra_words |= at < len(line)
-        if not lists:
-            lengths = {prop.name: [1] * element.count for prop in element.properties}
-        return _joined(
-            element, lengths, {p.name: [_numbers(element, p, words[p.name])] for p in element.properties}
-        )
+        names = [prop.name for prop in element.properties]
+        lengths: dict[str, list[int]] = {name: [1] * element.count for name in names}
+        if not any(prop.length_type for prop in element.properties):
+            flat: list[bytes] = []
+            for row in range(element.count if names else 0):
+                line = self._line(element)
+                self._check_width(element, row, line, len(names))
+                flat += line[: len(names)]
+            words = {name: flat[k :: len(names)] for k, name in enumerate(names)}
+        else:
+            words = {name: [] for name in names}
+            lengths |= {prop.name: [] for prop in element.properties if prop.length_type}
+            for row in range(element.count):
+                self._row_with_lists(element, row, lengths, words)
+        columns = {prop.name: [_numbers(element, prop, words[prop.name])] for prop in element.properties}
+        return _joined(element, lengths, columns)
+
+    def _line(self, element: _Element) -> list[bytes]:
+        for _, line in self._lines:
+            return line
+        raise _truncated(element)
+
+    def _check_width(self, element: _Element, row: int, line: list[bytes], width: int) -> None:
+        if len(line) != width:
+            if len(line) < width:
+                raise InvalidFile(f"row {row} of {element.name!r} has fewer numbers than declared")
+            self.extra_words = True
+
+    def _row_with_lists(
+        self, element: _Element, row: int, lengths: dict[str, list[int]], words: dict[str, list[bytes]]
+    ) -> None:
+        line = self._line(element)
+        at = 0
+        for prop in element.properties:
+            length = 1
+            if prop.length_type:
+                try:
+                    length = int(line[at]) if at < len(line) else len(line)
+                except ValueError:
+                    raise wrong_number(line[at:], int, f"row {row} of {element.name!r}") from None
+                at += 1
+                lengths[prop.name].append(length)
+            if not 0 <= length <= len(line) - at:
+                raise InvalidFile(f"row {row} of {element.name!r} has fewer numbers than declared")
+            words[prop.name] += line[at : at + length]
+            at += length
+        self._check_width(element, row, line, at)
 
     def finish(self) -> tuple[str, ...]:
         found = next(self._lines, None)
@@ -299,7 +322,8 @@ class _Text:
 
 
 def _numbers(element: _Element, prop: _Property, words: list[bytes]) -> Column:
-    where = f"{prop.name} of {element.name!r}"
-    if prop.whole:
-        return np.array(ints(words, where), dtype=np.int64)
-    return np.array(floats(words, where), dtype=np.float64)
+    kind = int if prop.whole else float
+    try:
+        return np.array(list(map(kind, words)), dtype=np.int64 if prop.whole else np.float64)
+    except (ValueError, OverflowError):
+        raise wrong_number(words, kind, f"{prop.name} of {element.name!r}") from None

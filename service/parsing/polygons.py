@@ -92,11 +92,15 @@ class Polygons:
         limits.check(len(self.vertices), int((self.sizes - 2).sum()))
         outside = np.flatnonzero((self.corners < 0) | (self.corners >= len(self.vertices)))
         if outside.size:
-            face = int(np.searchsorted(np.cumsum(self.sizes), outside[0], side="right"))
+            face = self.polygon_of(int(outside[0]))
             raise InvalidFile(
                 f"face {face} names vertex {self.corners[outside[0]]}, counted from 0; "
                 f"the file has {len(self.vertices)} vertices"
             )
+
+    def polygon_of(self, corner: int) -> int:
+        """Index of the polygon that a corner is part of."""
+        return int(np.searchsorted(np.cumsum(self.sizes), corner, side="right"))
 
     def triangles(self) -> tuple[Ints, tuple[str, ...]]:
         """Triangles of all polygons, in their order, and a note if any had more than three corners.

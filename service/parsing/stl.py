@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.parsing.polygons import InvalidFile, Limits, Polygons
-from service.parsing.text import floats, lines
+from service.parsing.text import lines, refuse_underscores, wrong_number
 
 _HEADER_BYTES = 84
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -48,6 +48,7 @@ def read(content: bytes, limits: Limits) -> Polygons:
 
 def _text_corners(content: bytes, limits: Limits) -> npt.NDArray[np.float64]:
     """Corners (3 F, 3) of all solids of a text STL."""
+    refuse_underscores(content, rb"(?i)^\s*vertex\s[^#\n]*_")
     corners = array("d")
     expected = 0
     solid = False
@@ -65,7 +66,10 @@ def _text_corners(content: bytes, limits: Limits) -> npt.NDArray[np.float64]:
         if keyword == b"vertex":
             if len(words) != 4:
                 raise InvalidFile(f"line {number}: a corner needs three coordinates")
-            corners.extend(floats(words[1:], f"line {number}"))
+            try:
+                corners.extend(map(float, words[1:]))
+            except ValueError:
+                raise wrong_number(words[1:], float, f"line {number}") from None
         expected = (expected + 1) % len(_LINES_OF_A_FACET)
         if expected == 0 and len(corners) > 9 * limits.faces:
             limits.check(0, len(corners) // 9)

@@ -20,6 +20,8 @@ import pytest
 import redis
 import uvicorn
 from fastapi import FastAPI
+from hypothesis import HealthCheck
+from hypothesis import settings as hypothesis_settings
 
 from service.app import create_app
 from service.embedded import EmbeddedRedis
@@ -37,6 +39,48 @@ def until(look: Callable[[], Found], seconds: float = 20.0) -> Found:
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.01)
     return found
+
+
+def children(pid: int) -> set[int]:
+    """Descendants of a process."""
+    found: set[int] = set()
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+        except OSError:
+            continue
+        if parent == pid:
+            found |= {int(entry.name)} | children(int(entry.name))
+    return found
+
+
+#: For hypotheses that ask the one service again and again.
+HTTP = hypothesis_settings(
+    max_examples=40,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+
+
+def energy(mesh: str, size: int = 8, **fields: Any) -> dict[str, Any]:
+    """A whole question: the energies of the uniform map of a mesh to itself, or of another map."""
+    basis = {"kind": "basis", "mesh": mesh, "size": size}
+    inner = fields.pop("map", {"type": "uniform"})
+    return {
+        "kind": "energy",
+        "softmap": {"kind": "softmap", "source": basis, "target": basis, "map": inner},
+        **fields,
+    }
+
+
+def is_problem(answer: httpx.Response, status: int, part: str = "") -> bool:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    document = answer.json()
+    assert document["status"] == status
+    assert {"type", "title", "detail", "errors"} <= document.keys()
+    assert part in answer.text
+    return True
 
 
 @dataclass(frozen=True)
@@ -85,6 +129,30 @@ def own_redis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[EmbeddedRedi
 @pytest.fixture(scope="session")
 def service(own_redis: EmbeddedRedis, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     settings = Settings(data=tmp_path_factory.mktemp("data"), redis_url=own_redis.url, threads=1)
+    with serving(settings) as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def idle(own_redis: EmbeddedRedis, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """A service whose jobs wait for ever: it has no worker."""
+    settings = Settings(data=tmp_path_factory.mktemp("idle"), redis_url=own_redis.url)
+    with serving(settings) as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def tight(own_redis: EmbeddedRedis, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """A service with little room for anything, and no worker."""
+    settings = Settings(
+        data=tmp_path_factory.mktemp("tight"),
+        redis_url=own_redis.url,
+        max_upload_bytes=60_000,
+        max_json_bytes=600,
+        max_array_bytes=100,
+        max_queued=4,
+        max_cost_seconds=0.6,
+    )
     with serving(settings) as running:
         yield running
 

@@ -240,7 +240,7 @@ def test_a_bent_polygon_becomes_a_fan_and_that_is_said() -> None:
         (off().replace("3 0 2 1", "3 0 2 -1"), "off", "face 0 names vertex -1"),
         (off().replace("3 0 2 1", "3 0 2 4"), "off", "face 0 names vertex 4"),
         (off().replace("3 0 2 1", "3 0 2 1.5"), "off", "'1.5' is not a whole number"),
-        (off().replace("1.0", "1_0.0", 1), "off", "'1_0.0' is not a number"),
+        (off().replace("1.0", "1_0.0", 1), "off", "line 4: a number with an underscore"),
         (
             "OFF\n6 2 0\n0 0 0 1 0 0\n0 1 0 0 0 1\n0 0 2 0 0 3\n3 0 1 2\n3 3 4 5\n",
             "off",

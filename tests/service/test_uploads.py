@@ -14,15 +14,12 @@ import numpy as np
 import pytest
 
 from service.uploads import InvalidUpload, Nursery, ReaderLost, ReadMesh, TooLargeUpload, Uploads
+from tests.service.conftest import children
 from tests.service.files import FACES, TETRAHEDRON, obj, off, ply
 from worker.settings import Settings
 
 Answer = TypeVar("Answer")
 Told = Callable[..., Any]
-
-
-def command(pid: int) -> str:
-    return Path(f"/proc/{pid}/cmdline").read_text()
 
 
 @pytest.fixture(scope="module")
@@ -73,19 +70,6 @@ def refusal(told: Told, content: bytes | str, file_format: str, **changes: float
     return str(refused.value)
 
 
-def children(pid: int) -> set[int]:
-    """Descendants of a process."""
-    found: set[int] = set()
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-        except OSError:
-            continue
-        if parent == pid:
-            found |= {int(entry.name)} | children(int(entry.name))
-    return found
-
-
 def test_a_mesh_comes_back_with_its_facts(told: Told) -> None:
     mesh = told(lambda uploads: read(uploads, ply(), "ply"))
     np.testing.assert_array_equal(mesh.vertices, TETRAHEDRON)
@@ -119,8 +103,8 @@ def test_a_file_that_takes_too_long_is_refused(told: Told) -> None:
 
 
 def test_a_file_that_takes_too_much_memory_is_refused(told: Told) -> None:
-    text = "v 0.5 0.5 0.5\n" * 1_000_000
-    assert "bytes of memory" in refusal(told, text, "obj", upload_memory_bytes=30_000_000)
+    text = "v 0.5 0.5 0.5\n" * 400_000
+    assert "bytes of memory" in refusal(told, text, "obj", upload_memory_bytes=15_000_000)
 
 
 def test_a_mesh_with_too_many_faces_is_too_large(told: Told) -> None:
@@ -138,18 +122,19 @@ def test_after_a_refusal_the_next_file_is_read(told: Told) -> None:
     assert told(story).facts["n_faces"] == 4
 
 
-def test_a_killed_reader_is_an_answer_and_a_killed_nursery_is_replaced(told: Told) -> None:
+def test_a_killed_reader_is_an_answer_and_a_killed_nursery_is_replaced(told: Told, nursery: Nursery) -> None:
     async def story(uploads: Uploads) -> ReadMesh:
         await read(uploads, off(), "off")
-        (nursery,) = (pid for pid in children(os.getpid()) if "service.nursery" in command(pid))
-        reading = asyncio.create_task(read(uploads, "v 0.5 0.5 0.5\n" * 1_000_000, "obj"))
+        pid = nursery.pid
+        assert pid is not None
+        reading = asyncio.create_task(read(uploads, "v 0.5 0.5 0.5\n" * 400_000, "obj"))
         until = time.monotonic() + 10
-        while not (readers := children(nursery)) and time.monotonic() < until:
+        while not (readers := children(pid)) and time.monotonic() < until:
             await asyncio.sleep(0.001)
         os.kill(readers.pop(), signal.SIGKILL)
         with pytest.raises(InvalidUpload, match="died"):
             await reading
-        os.kill(nursery, signal.SIGKILL)
+        os.kill(pid, signal.SIGKILL)
         await asyncio.sleep(0.05)
         return await read(uploads, off(), "off")
 
@@ -162,7 +147,7 @@ def test_no_process_and_no_file_is_left(settings: Settings) -> None:
     async def story() -> set[int]:
         nursery = Nursery()
         await nursery.start()
-        reading = asyncio.create_task(read(Uploads(settings, nursery), "v 0.5 0.5 0.5\n" * 1_000_000, "obj"))
+        reading = asyncio.create_task(read(Uploads(settings, nursery), "v 0.5 0.5 0.5\n" * 400_000, "obj"))
         until = time.monotonic() + 10
         while len(found := children(os.getpid())) < 2 + len(before) and time.monotonic() < until:
             await asyncio.sleep(0.001)
