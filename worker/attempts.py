@@ -106,7 +106,7 @@ class Attempt:
         Waiting in a queue; for its parents; running on an announced worker; ended in any way; unknown to
         Redis, lost, waiting for what never comes, or on a worker that is silent.
     died : bool
-        Whether it is gone since its worker fell silent.
+        Whether it ended by a fault of the machine: its worker fell silent, or RQ gave it up.
     known : bool
         Whether RQ knows it; a run that outlived a FLUSHALL is running but unknown.
     """
@@ -233,7 +233,10 @@ class Attempts:
             return Attempt(name, "waiting")
         if status == JobStatus.STARTED:
             return Attempt(name, "gone", died=True)
-        return Attempt(name, "deferred" if status == JobStatus.DEFERRED else "ended")
+        # RQ's failures are faults that struck again and again; failures of tasks are recorded in the store.
+        return Attempt(
+            name, "deferred" if status == JobStatus.DEFERRED else "ended", status == JobStatus.FAILED
+        )
 
     def _stuck(self, deferred: Mapping[str, Sequence[str]]) -> tuple[list[str], list[str]]:
         """Tasks whose deferred attempts wait for what never comes, and those that should have begun by now.

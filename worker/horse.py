@@ -31,6 +31,7 @@ from rq.worker import Worker
 from worker import attempts
 from worker.attempts import Attempts, TaskJob
 from worker.plan import MAX_DEATHS
+from worker.tasks import blas_pools
 
 if TYPE_CHECKING:
     from worker.tasks import Workplace
@@ -135,6 +136,7 @@ class SoftmapsWorker(Worker):
         if horse == 0:
             os.setpgid(0, 0)
             die_with(worker)
+            settle_blas()
             restrain(self._workplace.settings.task_memory_bytes)
             self.main_work_horse(job, queue)
             os._exit(0)
@@ -203,7 +205,7 @@ class SoftmapsWorker(Worker):
         if self._end == "overtime":
             self._workplace.fail_overtime(attempts.task_of(job.id), float(job.timeout or 0))
             job.retries_left = 0
-        elif self._stopped_job_id != job.id and _was_killed(status):
+        elif self._stopped_job_id != job.id and not self._workplace.store.has(attempts.task_of(job.id)):
             self._count_death(job, status)
         self.handle_job_failure(
             job, queue=queue, exc_string=f"the run ended with {status}", execution=execution
@@ -251,17 +253,22 @@ class SoftmapsWorker(Worker):
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
 
 
-def _was_killed(status: int | None) -> bool:
-    """Whether a process ended by a signal; an exit of its own accord is a fault that RQ has on record."""
-    return status is None or os.WIFSIGNALED(status)
-
-
 def die_with(parent: int) -> None:
     """Have the kernel kill this process when its parent ends (Linux)."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
         if os.getppid() != parent:  # it ended before the kernel was told
             os._exit(1)
+
+
+def settle_blas() -> None:
+    """Pin BLAS to one thread, and have it take its work space now: refused that later, it asks for ever."""
+    import numpy as np  # noqa: PLC0415  (loaded long before the fork, but not by those who only plan)
+    from scipy.linalg import blas  # noqa: PLC0415
+
+    blas_pools().limit(limits=1)
+    square = np.eye(128)
+    blas.dgemm(1.0, square @ square, square)
 
 
 def restrain(memory_bytes: int) -> None:
@@ -291,22 +298,21 @@ def work(workplace: Workplace, *, interactive: bool = False) -> None:
     def stop(signum: int, frame: FrameType | None) -> None:
         raise StopRequested
 
-    while True:
-        signal.signal(signal.SIGTERM, stop)
-        signal.signal(signal.SIGINT, stop)
-        try:
-            # A fresh name each time: the old one may still be in Redis.
-            name = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(2)}"
-            worker = SoftmapsWorker(workplace, name, interactive=interactive)
-            worker.work(logging_level="WARNING")
-            if worker.stopping:
-                return
-            _log.warning("the worker gave up; it starts anew")
-        except StopRequested:
-            return
-        except redis.exceptions.RedisError as error:
-            _log.warning("Redis is away: %s", error)
-        try:
+    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGINT, stop)
+    with contextlib.suppress(StopRequested):
+        while _worked(workplace, interactive):
             time.sleep(WATCH_SECONDS)
-        except StopRequested:
-            return
+
+
+def _worked(workplace: Workplace, interactive: bool) -> bool:
+    """Work until told to stop or Redis is lost; False if told to stop."""
+    # A fresh name each time: the old one may still be in Redis.
+    name = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(2)}"
+    worker: SoftmapsWorker | None = None
+    try:
+        worker = SoftmapsWorker(workplace, name, interactive=interactive)
+        worker.work(logging_level="WARNING")
+    except redis.exceptions.RedisError as error:
+        _log.warning("Redis is away: %s", error)
+    return worker is None or not worker.stopping

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
+import redis
+
 from worker import specs
 from worker.attempts import Attempt, Attempts
 from worker.fields import kind_of
@@ -82,11 +84,11 @@ class Step:
         return cls(started_at, float(fraction), phase)
 
 
-def steps(attempts: Attempts, tasks: Sequence[str]) -> dict[str, Step]:
+def steps(connection: redis.Redis, attempts: Attempts, tasks: Sequence[str]) -> dict[str, Step]:
     """How far some tasks are, those that said so lately."""
     if not tasks:
         return {}
-    said = attempts.connection.mget([attempts.key("progress", task) for task in tasks])
+    said = connection.mget([attempts.key("progress", task) for task in tasks])
     return {task: Step.load(one) for task, one in zip(tasks, said, strict=True) if one}
 
 
@@ -177,7 +179,7 @@ class _Looks:
     def __init__(self, store: Store, attempts: Attempts, tasks: list[str]) -> None:
         self._store = store
         self._attempts: Mapping[str, Attempt] = attempts.current(tasks)
-        self._steps: Mapping[str, Step] = steps(attempts, tasks)
+        self._steps: Mapping[str, Step] = steps(attempts.connection, attempts, tasks)
         self._statuses: dict[str, Status] = {}
 
     def status(self, task: str) -> Status:

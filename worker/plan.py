@@ -255,7 +255,7 @@ class Planner:
         timeout = max(TIMEOUT_FLOOR, round(TIMEOUT_FACTOR * node.cost.seconds))
         name = self._attempts.enqueue(node.id, parents, seconds=node.cost.seconds, timeout=timeout)
         if attempt.died:
-            _log.warning("%s: its worker fell silent; it runs again as %s", node.id, name)
+            _log.warning("%s: its worker died; it runs again as %s", node.id, name)
         return name
 
     def outdated(self, record: JobRecord) -> None:

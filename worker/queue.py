@@ -35,8 +35,10 @@ _log = logging.getLogger("softmaps.queue")
 _PATIENCE_SECONDS: Final = 20.0
 #: How long a dismissal watches the dismissed work end.
 DISMISSAL_SECONDS: Final = 10.0
-#: After Redis came back or was emptied, workers need this long to announce themselves again.
+#: Busy workers announce themselves again within this time after Redis was emptied.
 _COMEBACK_SECONDS: Final = 2.5
+#: And all workers within this time after Redis was started.
+_RESTART_SECONDS: Final = 5
 
 
 class Busy(Exception):
@@ -252,6 +254,8 @@ class Dispatcher:
         FinishedJob
             If it has succeeded or failed.
         """
+        if self._remember_epoch():
+            time.sleep(_COMEBACK_SECONDS)  # until workers have said again what they run
         with planning(self._attempts, _PATIENCE_SECONDS) as held:
             if not held:
                 raise Busy("others are being planned; ask again")
@@ -321,8 +325,6 @@ class Dispatcher:
         redis.exceptions.RedisError
             If Redis is away; call again.
         """
-        if self._attempts.uptime() < _COMEBACK_SECONDS:
-            return  # workers have not had the time to announce themselves
         self._attempts.tidy()
         records = list(self._store.open_jobs())
         if not records:
@@ -333,6 +335,8 @@ class Dispatcher:
         current = self._attempts.current([record.id for record in records], strict=True)
         if all(attempt.alive for attempt in current.values()):
             return
+        if any(attempt.died for attempt in current.values()) and self._attempts.uptime() < _RESTART_SECONDS:
+            return  # Redis was away: workers have not had the time to announce themselves
         with planning(self._attempts, 0.0) as held:
             if not held:
                 return

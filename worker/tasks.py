@@ -14,6 +14,8 @@ from functools import cache
 from typing import TYPE_CHECKING, Final
 
 import redis
+from redis.backoff import NoBackoff
+from redis.retry import Retry
 from rq.timeouts import JobTimeoutException
 
 from worker import jobs, library, specs
@@ -28,6 +30,8 @@ from worker.stages import Bench, Made, Report, stage
 from worker.store import JobRecord, Store, StoreError, now
 
 if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
+
     from solver.errors import SolverError
 
 _log = logging.getLogger("softmaps.worker")
@@ -82,10 +86,14 @@ class Workplace:
             raise ValueError("a worker needs SOFTMAPS_REDIS_URL")
         self.settings = settings
         self.store = Store(settings.store_folder)
-        self.connection = redis.Redis.from_url(settings.redis_url)
-        # Notes of progress must never hold up a task: their own connection, with little patience.
+        # The worker has its own patience; redis-py's would be added to it, up to ten seconds a command.
+        self.connection = redis.Redis.from_url(settings.redis_url, retry=Retry(NoBackoff(), 1))
+        # Notes of progress must never hold up a task: their own connection, with none.
         self._notes = redis.Redis.from_url(
-            settings.redis_url, socket_timeout=_NOTE_TIMEOUT, socket_connect_timeout=_NOTE_TIMEOUT
+            settings.redis_url,
+            socket_timeout=_NOTE_TIMEOUT,
+            socket_connect_timeout=_NOTE_TIMEOUT,
+            retry=Retry(NoBackoff(), 0),
         )
         self.attempts = Attempts(self.connection, self.store.identity, specs.versions_digest())
         self.threads = settings.threads or len(os.sched_getaffinity(0))
@@ -93,10 +101,10 @@ class Workplace:
     def prepare(self) -> None:
         """Load what every task needs, before the worker forks; nothing of it is run, no thread is begun."""
         import scipy.sparse.linalg  # noqa: F401, PLC0415  (half a second that every horse inherits)
-        import threadpoolctl  # noqa: F401, PLC0415
 
         import solver  # noqa: F401, PLC0415
 
+        blas_pools()
         versions()
 
     def close(self) -> None:
@@ -145,31 +153,29 @@ class Workplace:
         self._make(record, spec, shards, notes)
 
     def _make(self, record: JobRecord, spec: specs.Spec, shards: tuple[str, ...], notes: Notes) -> None:
-        import threadpoolctl  # noqa: PLC0415  (planning needs none of these)
-
-        from solver import SolverError  # noqa: PLC0415
+        from solver import SolverError  # noqa: PLC0415  (planning does without)
 
         task = record.id
         begun = time.perf_counter()
         bench = Bench(Reader(self.store), self.threads, notes.step, shards)
         try:
-            with threadpoolctl.threadpool_limits(1):
+            with blas_pools().limit(limits=1):
                 notes.step("reading", 0.0, 0.0)
                 made = stage(spec).make(spec, bench)
             seconds = time.perf_counter() - begun
             self._keep(record, spec, made, seconds, notes)
         except SolverError as error:
-            self._fail(task, refused(task, error), notes)
+            self._fail(task, refused(task, error))
         except MemoryError:
-            self._fail(task, memory(task, self.settings.task_memory_bytes), notes)
+            self._fail(task, memory(task, self.settings.task_memory_bytes))
         except JobTimeoutException:
-            self._fail(task, overtime(task, time.perf_counter() - begun), notes)
+            self._fail(task, overtime(task, time.perf_counter() - begun))
         except (StoreError, OSError, redis.exceptions.RedisError) as error:
-            self._fault(task, error, notes)
+            self._fault(task, error)
         except Exception:
             _log.exception("%s: internal error", task)
             detail = "an error in softmaps itself; its log says more"
-            self._fail(task, library.problem("internal-error", "Internal error", detail, task=task), notes)
+            self._fail(task, library.problem("internal-error", "Internal error", detail, task=task))
         else:
             words = "%s: %s, %s, %.2f s, residual %.1e"
             _log.info(words, task, spec.kind, made.sizes, seconds, made.residual)
@@ -189,20 +195,27 @@ class Workplace:
                 "seconds": round(seconds + made.seconds, 3),
                 "threads": self.threads,
                 "versions": versions(),
-                "started_at": notes.first([each.id for each in record.tasks]),
+                "started_at": self._begun(record) or notes.started_at,
             },
             adopts=made.adopts,
         )
 
-    def _fail(self, task: str, found: Problem, notes: Notes | None = None) -> None:
+    def _fail(self, task: str, found: Problem) -> None:
         """Record a failure."""
-        started_at = None
-        if notes is not None and (record := self.store.job(task)):
-            started_at = notes.first([each.id for each in record.tasks])
-        library.fail(self.store, task, found, started_at=started_at)
-        _log.info("%s: failed: %s", task, found["detail"])
+        record = self.store.job(task)
+        if record is not None:
+            library.fail(self.store, task, found, started_at=self._begun(record))
+            _log.info("%s: failed: %s", task, found["detail"])
 
-    def _fault(self, task: str, error: Exception, notes: Notes) -> None:
+    def _begun(self, record: JobRecord) -> str | None:
+        """When the first of a job's tasks began, as far as Redis tells."""
+        try:
+            steps = jobs.steps(self._notes, self.attempts, [each.id for each in record.tasks])
+        except redis.exceptions.RedisError:
+            return None
+        return min((step.started_at for step in steps.values()), default=None)
+
+    def _fault(self, task: str, error: Exception) -> None:
         """Have a task run again after a fault of the machine, but not for ever."""
         _log.warning("%s: %s: %s", task, type(error).__name__, error)
         try:
@@ -211,7 +224,7 @@ class Workplace:
             faults = 0
         if faults >= MAX_DEATHS:
             detail = f"the machine failed {faults} times: {_words(error)}"
-            self._fail(task, library.problem("machine-fault", "Machine fault", detail, task=task), notes)
+            self._fail(task, library.problem("machine-fault", "Machine fault", detail, task=task))
         elif not isinstance(error, StoreError):
             raise error
         # A parent that was damaged or forgotten is made again by the reconciling loop, then this task.
@@ -231,7 +244,7 @@ class Notes:
         self._connection = connection
         self._attempts = attempts
         self._task = task
-        self._started_at = now()
+        self.started_at = now()
         self._phase = "starting"
         self._next = 0.0
 
@@ -245,20 +258,12 @@ class Notes:
         moment = time.monotonic()
         if moment < self._next:
             return
-        said = Step(self._started_at, min(1.0, max(0.0, fraction)), self._phase).dump()
+        said = Step(self.started_at, min(1.0, max(0.0, fraction)), self._phase).dump()
         try:
             self._connection.set(self._attempts.key("progress", self._task), said, ex=jobs.STEP_SECONDS)
             self._next = moment + NOTE_SECONDS
         except redis.exceptions.RedisError:
             self._next = moment + _NOTE_PAUSE
-
-    def first(self, tasks: list[str]) -> str:
-        """When the first of some tasks began, this one among them."""
-        try:
-            others = jobs.steps(self._attempts, tasks)
-        except redis.exceptions.RedisError:
-            others = {}
-        return min([self._started_at, *(step.started_at for step in others.values())])
 
 
 def refused(task: str, error: SolverError) -> Problem:
@@ -288,6 +293,16 @@ def memory(task: str, limit: int) -> Problem:
 def _words(error: Exception) -> str:
     """What a fault is, without the paths that only this machine's owner may see."""
     return (error.strerror if isinstance(error, OSError) else None) or type(error).__name__
+
+
+@cache
+def blas_pools() -> ThreadpoolController:
+    """Thread pools of the BLAS libraries that the solver loads; finding them takes 15 ms."""
+    import threadpoolctl  # noqa: PLC0415  (planning does without)
+
+    import solver  # noqa: F401, PLC0415
+
+    return threadpoolctl.ThreadpoolController()
 
 
 @cache

@@ -51,7 +51,7 @@ def ask(dispatcher: Dispatcher, **spec: Any) -> Job:
 
 
 def energy(mesh: str, size: int, **fields: Any) -> dict[str, Any]:
-    """Spec of the energy of a map from a mesh to itself, all parents inline; uniform unless `map` says more."""
+    """Spec of the energy of a map from a mesh to itself, parents inline; uniform unless `map` is given."""
     basis = {"kind": "basis", "mesh": mesh, "size": size}
     inner = fields.pop("map", {"type": "uniform"})
     softmap = {"kind": "softmap", "source": basis, "target": basis, "map": inner}
