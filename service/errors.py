@@ -26,6 +26,7 @@ import redis.exceptions
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 
 from service.replies import job_reply
@@ -205,6 +206,7 @@ def register(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, _http_exception)
     app.add_exception_handler(RequestValidationError, _invalid_parameters)
     app.add_exception_handler(OSError, _system_error)
+    app.add_exception_handler(ClientDisconnect, _left)
     app.add_exception_handler(Exception, _unforeseen)
     for kind in STATUS_OF:
         app.add_exception_handler(kind, _known)
@@ -250,6 +252,10 @@ async def _system_error(_: Request, error: Exception) -> Response:
         log.error("the system refuses: %s", error)
         return problem(503, "This machine is out of disk or of open files")
     return await _unforeseen(_, error)
+
+
+async def _left(_: Request, error: Exception) -> Response:
+    return problem(400, "The body ended before its end")  # nobody hears it
 
 
 async def _unforeseen(_: Request, error: Exception) -> Response:

@@ -36,6 +36,8 @@ class BoundedRequest(Request):
 
     Raises
     ------
+    UnsupportedFormat
+        If the body is compressed.
     TooLargeUpload
         At once if its Content-Length says so, else while it is read.
     SlowUpload
@@ -47,6 +49,8 @@ class BoundedRequest(Request):
         self._inner = request.receive
         self._limit = limit
         self._size = 0
+        if request.headers.get("content-encoding", "identity").lower() != "identity":
+            raise UnsupportedFormat("compressed bodies are not supported: send the file as it is")
         announced = request.headers.get("content-length", "")
         self._too_large = announced.isdecimal() and int(announced) > limit
 

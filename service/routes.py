@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import AsyncGenerator
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Any
 
 import numpy.typing as npt
@@ -125,7 +126,8 @@ def _stored(store: Store, new: _Upload) -> tuple[Manifest, int]:
     standing = store.manifest(new.id)
     if standing is not None:
         return standing, 200
-    made = {"seconds": round(time.monotonic() - new.began, 6), "threads": 1, "versions": {}}
+    seconds = round(time.monotonic() - new.began, 6)
+    made = {"seconds": seconds, "threads": 1, "versions": {"softmaps": version("softmaps")}}
     written = store.put(
         new.id, kind=new.kind, spec=None, parents={}, values=new.values, arrays=new.arrays, made=made
     )

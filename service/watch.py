@@ -39,6 +39,7 @@ class Watch:
         self._seen_at = 0.0
         self._looked = asyncio.Condition()
         self._poller: asyncio.Task[None] | None = None
+        self._blind = False
 
     @property
     def waiting(self) -> int:
@@ -97,10 +98,13 @@ class Watch:
             try:
                 watched = tuple(self._watchers)
                 self._seen = await loop.run_in_executor(self._thread, self._look_at, watched)
-                self._seen_at = began
+                self._seen_at, self._blind = began, False
             except Exception as error:
-                # Redis may be away for a while: who waits goes on waiting.
-                log.warning("jobs cannot be looked at: %s", error)
+                # Redis may be away for a while: who waits goes on waiting, and the log hears of it once.
+                log.log(
+                    logging.DEBUG if self._blind else logging.WARNING, "jobs cannot be looked at: %s", error
+                )
+                self._blind = True
             async with self._looked:
                 self._looked.notify_all()
             await asyncio.sleep(max(INTERVAL_SECONDS, (time.monotonic() - began) / SHARE))

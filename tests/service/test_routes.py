@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from service import receiving
-from tests.service.conftest import HTTP, Service, is_problem
+from tests.service.conftest import HTTP, Service, is_problem, until
 from tests.service.files import FACES, TETRAHEDRON, glb, obj, off, ply, scene, stl
 
 # Meshes -----------------------------------------------------------------------------------------------------
@@ -113,6 +113,21 @@ def test_a_client_that_waits_for_100_continue_is_refused_before_it_sends(service
         )
         raw.settimeout(5)
         assert raw.recv(12) == b"HTTP/1.1 413"
+
+
+def test_a_compressed_body_is_415(http: httpx.Client) -> None:
+    headers = {"Content-Encoding": "gzip"}
+    assert is_problem(http.post("/v1/meshes?format=off", content=off(), headers=headers), 415, "compressed")
+
+
+def test_a_sender_that_leaves_is_no_error_of_ours(
+    service: Service, http: httpx.Client, caplog: pytest.LogCaptureFixture
+) -> None:
+    with socket.create_connection(service.url.removeprefix("http://").split(":")) as raw:
+        raw.sendall(b"POST /v1/meshes?format=off HTTP/1.1\r\nHost: x\r\nContent-Length: 100\r\n\r\nOFF\n")
+    left = 'method="POST",route="/v1/meshes",status="400"'
+    until(lambda: left in http.get("/metrics").text)
+    assert not [record for record in caplog.records if record.levelname == "ERROR"]
 
 
 def test_a_sender_that_pauses_is_given_up(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
