@@ -97,7 +97,7 @@ class Stack:
         shown = "127.0.0.1" if host in {"0.0.0.0", "::", "localhost"} else host
         self.url = f"http://{f'[{shown}]' if ':' in shown else shown}:{self._listener.getsockname()[1]}"
         self._children: list[Child] = []
-        self._ending, self._settled = threading.Event(), threading.Event()
+        self._ending, self._settled, self._ended = threading.Event(), threading.Event(), threading.Event()
         self._failure = ""
         # Children are started by one thread that outlives them: the kernel ties them to the thread.
         self._thread = threading.Thread(target=self._run, name="softmaps-stack", daemon=True)
@@ -120,7 +120,8 @@ class Stack:
         """End everything: workers first, which hand back what they do, then the API, then Redis."""
         self._ending.set()
         if self._thread.ident is not None:
-            self._thread.join()
+            # Not join(): interrupted by Ctrl-C, Python 3.11 takes the thread for ended.
+            self._ended.wait()
         self._listener.close()
         self._lock.close()
 
@@ -132,8 +133,7 @@ class Stack:
         StackError
             If it ended by itself; says why.
         """
-        self._thread.join(seconds)
-        if not self._thread.is_alive():
+        if self._ended.wait(seconds):
             raise StackError(self._failure or "the stack was stopped")
 
     @property
@@ -167,7 +167,9 @@ class Stack:
             environment = self._environment(server.url if server else str(self.settings.redis_url))
             self._watch(server, environment)
         except (RuntimeError, OSError) as error:
-            self._failure = self._failure or str(error)
+            self._failure = str(error)
+        except Exception as error:
+            self._failure = f"{type(error).__name__}: {error}"
         finally:
             if self._public:
                 self._endpoint.unlink(missing_ok=True)
@@ -175,6 +177,7 @@ class Stack:
             if server is not None:
                 server.stop()
             self._settled.set()
+            self._ended.set()
 
     def _watch(self, server: EmbeddedRedis | None, environment: dict[str, str]) -> None:
         logs = self.settings.data / "logs"

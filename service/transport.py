@@ -50,6 +50,7 @@ class Transport:
             raise Unusable(f"{url!r} is no address of a service; say http://host:port")
         self.url = url.rstrip("/")
         self._patience = patience
+        self._answered = False
         self._http = httpx.Client(
             base_url=self.url,
             headers={"Authorization": f"Bearer {token}"} if token else {},
@@ -120,11 +121,13 @@ class Transport:
             try:
                 response = self._http.send(request, stream=True)
             except httpx.TransportError as error:
-                # Refused connections too: a service that restarts is back in a moment.
-                if time.monotonic() + USUAL_PAUSE > deadline or isinstance(error, httpx.ReadTimeout):
+                # A service that was there is being restarted; one that never answered is not there.
+                hopeless = not self._answered or isinstance(error, httpx.ReadTimeout)
+                if hopeless or time.monotonic() + USUAL_PAUSE > deadline:
                     raise Unreachable(f"no answer from {self.url}: {error}") from error
                 time.sleep(USUAL_PAUSE)
                 continue
+            self._answered = True
             pause = _pause(response)
             if response.status_code in LATER and time.monotonic() + pause <= deadline:
                 response.close()
