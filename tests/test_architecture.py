@@ -43,9 +43,9 @@ def test_no_module_is_two_rooms(path: Path) -> None:
     assert len(path.read_text().splitlines()) <= LONGEST_MODULE
 
 
-def test_only_the_queue_and_the_tasks_speak_rq() -> None:
+def test_only_attempts_and_the_processes_that_run_them_speak_rq() -> None:
     speakers = {str(path.relative_to(ROOT)) for path in MODULES if "rq" in imported_packages(path)}
-    assert speakers <= {"worker/queue.py", "worker/tasks.py"}
+    assert speakers <= {"worker/attempts.py", "worker/horse.py", "worker/tasks.py"}
 
 
 def test_importing_the_service_loads_nothing_heavy() -> None:
