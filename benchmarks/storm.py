@@ -75,9 +75,9 @@ def storm(stack: Stack, client: Client, *, flush: bool) -> None:
     poses = [client.upload_mesh(creature(pose)).id for pose in ("standing", "trotting")]
     ball = trimesh.creation.icosphere(subdivisions=5)
     sphere = client.upload_mesh((ball.vertices, ball.faces)).id
-    long = [client.submit(energy(sphere, sphere, 600, 1e-5 * (k + 1))).id for k in range(LONG)]
-    while not all(client.job(id_).status == "running" for id_ in long[:2]):
-        time.sleep(0.05)
+    specs = [energy(sphere, sphere, 600, 1e-5 * (k + 1)) for k in range(LONG)]
+    client.wait(client.submit(specs[0]["softmap"]).id, timeout=600)
+    long = [client.submit(spec).id for spec in specs]
 
     def submit(number: int) -> list[str]:
         with Client(stack.url) as mine:
