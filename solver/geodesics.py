@@ -7,7 +7,7 @@ the one point in the plane of the face that lies at both distances, which is exa
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -71,6 +71,37 @@ def distances_from(mesh: Mesh, vertex: int) -> FloatArray:
     surface, scratch = _surface(mesh), _scratch(mesh.n_vertices)
     _march(vertex, *surface, np.full(mesh.n_vertices, np.inf), *scratch)
     return scratch[0]
+
+
+def discs(mesh: Mesh, centres: IntArray, radii: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
+    """Vertices within a radius of each of several vertices, nearest first, with their distances.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Any mesh.
+    centres : ndarray of int64, shape (k,)
+        Corners of faces.
+    radii : ndarray of float64, shape (k,)
+        In √area.
+
+    Yields
+    ------
+    vertices : ndarray of int64, shape (m,)
+        The centre itself comes first.
+    distances : ndarray of float64, shape (m,)
+        In √area, ascending.
+    """
+    surface, scratch = _surface(mesh), _scratch(mesh.n_vertices)
+    distance, touched, passed = scratch[:3]
+    for centre, radius in zip(centres, radii, strict=True):
+        n_touched = _march(centre, *surface, np.full(mesh.n_vertices, radius), *scratch)
+        reached = np.sort(touched[:n_touched])
+        distances = distance[reached]
+        distance[reached], passed[reached] = np.inf, 0
+        order = np.argsort(distances, kind="stable")
+        order = order[: np.searchsorted(distances[order], radius, side="right")]
+        yield reached[order], distances[order]
 
 
 def farthest_point_samples(
