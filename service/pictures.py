@@ -26,7 +26,7 @@ LOWEST, HIGHEST = 4.0, 99.0
 #: A scale is at least this wide, or the rounding of a constant density would look like structure.
 LEAST_RATIO = 1.01
 #: Decades of a logarithmic scale at most; below them a density is as good as zero.
-DECADES = 3.0
+DECADES = 5.0
 #: Ratio of its ends from which a logarithmic scale has a label a decade.
 WIDE = 100.0
 #: Samples per pixel and direction; edges are smooth because they are averaged.
