@@ -140,7 +140,7 @@ def answered(client: Client, screen: Screen, spec: Mapping[str, Any], title: str
     ClientError
         If the service refuses or the job fails.
     """
-    with screen.waiting(title) as progress:
+    with screen.waiting() as progress:
         job = client.wait(
             client.submit(spec).id, None if progress.disable else Bars(progress, title, client.job)
         )

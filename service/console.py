@@ -16,7 +16,15 @@ import typer
 from pydantic import ValidationError
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    SpinnerColumn,
+    TaskID,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
 from rich.table import Table
 
 from service.answers import Artifact, Job
@@ -72,20 +80,21 @@ class Screen:
         raise typer.Exit(code)
 
     @contextmanager
-    def waiting(self, words: str) -> Iterator[Progress]:
-        """Show progress while the block runs: a spinner with words, and what `Bars` adds."""
+    def waiting(self, words: str = "") -> Iterator[Progress]:
+        """Show progress while the block runs: a spinner with words, if any, and what `Bars` adds."""
         progress = Progress(
             SpinnerColumn(finished_text=" "),
             TextColumn("{task.description}"),
             BarColumn(bar_width=28),
-            TextColumn("{task.percentage:>3.0f} %"),
+            TaskProgressColumn(text_format_no_percentage=""),
             TimeElapsedColumn(),
             console=self._err,
             transient=True,
             disable=self.machine or not self._err.is_terminal,
         )
         with progress:
-            progress.add_task(words, total=None)
+            if words:
+                progress.add_task(words, total=None)
             yield progress
 
 
@@ -114,7 +123,7 @@ class Bars:
         self._progress.update(
             self._whole,
             completed=job.progress,
-            description=f"[bold]{escape(self._title)}[/] {escape(job.phase)}",
+            description=f"[bold]{escape(self._title)}[/] · {escape(job.phase)}",
         )
         names = labels(job)
         for task in job.tasks:
@@ -147,7 +156,13 @@ def labels(job: Job) -> dict[str, str]:
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
     """Table of words; the first column to the left, the others to the right."""
     drawn = Table(
-        title=title, title_justify="left", title_style="bold", header_style="dim", box=None, pad_edge=False
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        header_style="dim",
+        box=None,
+        pad_edge=False,
+        show_header=any(columns),
     )
     for number, column in enumerate(columns):
         drawn.add_column(column, justify="left" if number == 0 else "right", no_wrap=number > 0)

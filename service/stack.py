@@ -136,11 +136,6 @@ class Stack:
         if self._ended.wait(seconds):
             raise StackError(self._failure or "the stack was stopped")
 
-    @property
-    def deaths(self) -> int:
-        """How often a child had to be replaced."""
-        return sum(child.deaths for child in self._children)
-
     def __enter__(self) -> Self:
         try:
             self.start()
