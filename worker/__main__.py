@@ -24,6 +24,7 @@ def main() -> None:
     logging.basicConfig(
         level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr
     )
+    logging.getLogger("rq").setLevel(logging.WARNING)
     place = workplace()
     place.prepare()
     work(place, interactive=arguments.interactive)

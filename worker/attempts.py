@@ -20,14 +20,15 @@ from rq.job import Dependency, Job, JobStatus, Retry
 from rq.queue import Queue
 from rq.results import Result
 
+from worker import presence
+from worker.presence import Presence
+
 #: The only function that a worker of ours runs.
 FUNCTION: Final = "worker.tasks.run_task"
 #: How long Redis remembers an attempt that ended, in seconds.
 KEPT_SECONDS: Final = 3600
 #: Runs of one attempt after the first, for machine faults alone.
 RETRIES: Final = 2
-#: A worker announces itself every second or three; silent for this long, it counts as dead.
-ANNOUNCED_SECONDS: Final = 8
 #: An attempt that is neither waiting nor running for this long was lost between the two.
 LOST_SECONDS: Final = 5
 #: Sightings of a lost attempt further apart than this are two different stories.
@@ -74,27 +75,6 @@ class TaskJob(Job):
 
 
 @dataclass(frozen=True)
-class Worker:
-    """What a worker announces.
-
-    Attributes
-    ----------
-    name, host : str
-    pid : int
-    interactive : bool
-        Whether it takes short tasks only.
-    attempt : str
-        RQ id of what it runs, empty when idle.
-    """
-
-    name: str
-    host: str
-    pid: int
-    interactive: bool
-    attempt: str
-
-
-@dataclass(frozen=True)
 class Attempt:
     """One try of a task, as Redis knows it.
 
@@ -138,6 +118,7 @@ class Attempts:
     def __init__(self, connection: redis.Redis, identity: str, versions: str) -> None:
         self.connection = connection
         self._prefix = f"softmaps:{identity}"
+        self.presence = Presence(connection, self._prefix)
         self.queues: dict[str, Queue] = {
             name: Queue(
                 f"softmaps-{identity}-{versions}-{name}",
@@ -151,31 +132,6 @@ class Attempts:
     def key(self, *parts: str) -> str:
         """Name of one of our own keys."""
         return ":".join((self._prefix, *parts))
-
-    # Workers
-
-    def announce(self, worker: Worker, pipeline: redis.client.Pipeline) -> None:
-        """Say that a worker is there, and what it runs, for the next eight seconds."""
-        pipeline.sadd(self.key("workers"), worker.name)
-        pipeline.set(self.key("worker", worker.name), json.dumps(worker.__dict__), ex=ANNOUNCED_SECONDS)
-
-    def withdraw(self, name: str) -> None:
-        """Forget a worker."""
-        self.connection.srem(self.key("workers"), name)
-        self.connection.delete(self.key("worker", name))
-
-    def workers(self) -> list[Worker]:
-        """Workers that announced themselves lately."""
-        pipeline = self.connection.pipeline(transaction=False)
-        self._ask_workers(pipeline)
-        return self._read_workers(pipeline.execute()[0])
-
-    def _ask_workers(self, pipeline: redis.client.Pipeline) -> None:
-        # SORT … GET reads the members and what they announced in one step, so none can slip between.
-        pipeline.sort(self.key("workers"), by="nosort", get=[self.key("worker", "*")])
-
-    def _read_workers(self, answers: Iterable[bytes | None]) -> list[Worker]:
-        return [Worker(**json.loads(answer)) for answer in answers if answer]
 
     # Looking
 
@@ -196,24 +152,32 @@ class Attempts:
             return {}
         names = [_text(name) for name in self.connection.mget([self.key("task", task) for task in tasks])]
         pipeline = self.connection.pipeline()
-        self._ask_workers(pipeline)
+        self.presence.ask(pipeline)
         for queue in self.queues.values():
             pipeline.lrange(queue.key, 0, -1)
+        for queue in self.queues.values():
+            pipeline.zrange(queue.started_job_registry.key, 0, -1)
         for name in names:
             pipeline.hmget(Job.key_for(name), "status", "origin", "dependency_ids")
-        answers = pipeline.execute()
-        running = {worker.attempt for worker in self._read_workers(answers[0]) if worker.attempt}
-        waiting = {_text(item) for answer in answers[1 : 1 + len(self.queues)] for item in answer}
-        found, deferred = {}, {}
-        for task, name, answer in zip(tasks, names, answers[1 + len(self.queues) :], strict=True):
+        said, *answers = pipeline.execute()
+        running = {worker.attempt for worker in presence.read(said) if worker.attempt}
+        n_queues = len(self.queues)
+        waiting = {_text(item) for queue in answers[:n_queues] for item in queue}
+        begun = {
+            _text(item).partition(":")[0] for queue in answers[n_queues : 2 * n_queues] for item in queue
+        }
+        found, unseen, deferred = {}, [], {}
+        for task, name, answer in zip(tasks, names, answers[2 * n_queues :], strict=True):
             status, origin, dependencies = map(_text, answer)
             found[task] = self._judged(task, name, (status, origin), running)
             if found[task].state == "deferred":
                 deferred[task] = json.loads(dependencies or "[]")
+            elif found[task].state == "waiting" and name not in waiting:
+                if name in begun:  # its worker died before the horse could say anything
+                    found[task] = Attempt(name, "gone", died=True)
+                else:
+                    unseen.append(task)
         if strict:
-            unseen = [
-                task for task, one in found.items() if one.state == "waiting" and one.name not in waiting
-            ]
             hopeless, idle = self._stuck(deferred)
             hopeless += [task for task in unseen + idle if self._lost(found[task].name)]
             found |= {task: Attempt(found[task].name, "gone") for task in hopeless}
@@ -326,7 +290,7 @@ class Attempts:
     def stop(self, tasks: Iterable[str]) -> int:
         """Tell workers to kill their runs of some tasks; returns how many still run."""
         wanted = set(tasks)
-        running = [each for each in self.workers() if task_of(each.attempt) in wanted]
+        running = [each for each in self.presence.workers() if task_of(each.attempt) in wanted]
         for worker in running:
             send_command(self.connection, worker.name, "stop-job", job_id=worker.attempt)
         return len(running)
@@ -352,6 +316,7 @@ class Attempts:
 
     def tidy(self) -> None:
         """Forget what ended long ago and release children that a dying worker left ready but not queued."""
+        self.presence.prune()
         for queue in self.queues.values():
             queue.finished_job_registry.cleanup()
             queue.failed_job_registry.cleanup()
@@ -376,7 +341,7 @@ class Attempts:
         answers = pipeline.execute()
         found = dict(zip(self.queues, answers[0::2], strict=True))
         found["deferred"] = sum(answers[1::2])
-        found["running"] = sum(1 for worker in self.workers() if worker.attempt)
+        found["running"] = sum(1 for worker in self.presence.workers() if worker.attempt)
         return found
 
 

@@ -28,7 +28,7 @@ from rq.queue import Queue
 from rq.timeouts import HorseMonitorTimeoutException
 from rq.worker import Worker
 
-from worker import attempts
+from worker import attempts, presence
 from worker.attempts import Attempts, TaskJob
 from worker.plan import MAX_DEATHS
 from worker.tasks import blas_pools
@@ -99,20 +99,23 @@ class SoftmapsWorker(Worker):
 
     def get_heartbeat_ttl(self, job: Job, working_time: float = 0.0) -> int:
         """Seconds after which a silent run counts as abandoned."""
-        return attempts.ANNOUNCED_SECONDS
+        return presence.ANNOUNCED_SECONDS
 
     def _announce(self) -> None:
-        said = attempts.Worker(
+        said = presence.Worker(
             self.name, self.hostname or "", self.pid or 0, self._interactive, self._running
         )
-        with self.connection.pipeline() as pipeline:
-            self._attempts.announce(said, pipeline)
-            pipeline.execute()
+        self._attempts.presence.announce(said)
 
     def register_death(self) -> None:
         """Take leave of RQ and of our own list."""
-        self._attempts.withdraw(self.name)
+        self._attempts.presence.withdraw(self.name)
         super().register_death()  # type: ignore[no-untyped-call]
+
+    def unsubscribe(self) -> None:
+        """Let the thread that listens for commands end by itself: waiting for it takes a second."""
+        if self.pubsub_thread is not None:
+            self.pubsub_thread.stop()
 
     def run_maintenance_tasks(self) -> None:
         """Do nothing: reconciling is the API's, and RQ's own would run one attempt twice at a time."""

@@ -258,11 +258,11 @@ class Planner:
             _log.warning("%s: its worker died; it runs again as %s", node.id, name)
         return name
 
-    def outdated(self, record: JobRecord) -> None:
+    def outdated(self, id_: str) -> None:
         """Record that a task cannot be done any more, since its kind has another version now."""
         detail = "this version of softmaps answers such questions differently: ask again"
-        found = library.problem("outdated", "Another version", detail, task=record.id)
-        library.fail(self._store, record.id, found)
+        found = library.problem("outdated", "Another version", detail, task=id_)
+        library.fail(self._store, id_, found)
 
     def _cause(self, node: Node, failed: dict[str, library.Problem | None]) -> library.Problem | None:
         return next(

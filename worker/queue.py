@@ -33,6 +33,9 @@ _log = logging.getLogger("softmaps.queue")
 
 #: Longest wait for somebody else's planning before a request is given up.
 _PATIENCE_SECONDS: Final = 20.0
+#: The same for a pass of reconciling, which comes again; and how many tasks it plans at once.
+_PASS_SECONDS: Final = 1.0
+_TOGETHER: Final = 50
 #: How long a dismissal watches the dismissed work end.
 DISMISSAL_SECONDS: Final = 10.0
 #: Busy workers announce themselves again within this time after Redis was emptied.
@@ -226,11 +229,14 @@ class Dispatcher:
         return found, None
 
     def _listed(self, status: Status | None, after: str | None) -> Iterator[JobRecord]:
-        """Records that may have some status."""
+        """Records that may have some status, as far as they tell themselves."""
         if status in ("accepted", "running"):
             records: Iterator[JobRecord] = iter(sorted(self._store.open_jobs(), key=cursor_of))
             return (each for each in records if each.asked and (after is None or cursor_of(each) > after))
-        return (each for each in self._store.jobs(after) if each.asked)
+        asked = (each for each in self._store.jobs(after) if each.asked)
+        if status in ("failed", "dismissed"):
+            return (each for each in asked if each.outcome == status)
+        return asked
 
     def dismiss(self, id_: str) -> Dismissal:
         """Drop a job, its runs, and what only it needed.
@@ -333,19 +339,25 @@ class Dispatcher:
         if self._remember_epoch():
             time.sleep(_COMEBACK_SECONDS)
         current = self._attempts.current([record.id for record in records], strict=True)
-        if all(attempt.alive for attempt in current.values()):
+        idle = [id_ for id_, attempt in current.items() if not attempt.alive]
+        if not idle:
             return
-        if any(attempt.died for attempt in current.values()) and self._attempts.uptime() < _RESTART_SECONDS:
+        if any(current[id_].died for id_ in idle) and self._attempts.uptime() < _RESTART_SECONDS:
             return  # Redis was away: workers have not had the time to announce themselves
-        with planning(self._attempts, 0.0) as held:
-            if not held:
-                return
-            known = Library(self._store)
-            for record in records:
-                if known(record.id) is None:
-                    self._planner.outdated(record)
-            nodes = self._planner.missing([record.id for record in records], known)
-            self._planner.attempt(nodes, rerun=False)
+        # A few at a time, so that whoever asks meanwhile need not wait for all.
+        for start in range(0, len(idle), _TOGETHER):
+            with planning(self._attempts, _PASS_SECONDS) as held:
+                if not held:
+                    return
+                self._revive(idle[start : start + _TOGETHER])
+
+    def _revive(self, ids: list[str]) -> None:
+        """Give open tasks attempts, and what they need."""
+        known = Library(self._store)
+        for id_ in ids:
+            if known(id_) is None:
+                self._planner.outdated(id_)
+        self._planner.attempt(self._planner.missing(ids, known), rerun=False)
 
     def _remember_epoch(self) -> bool:
         """Leave a key that a FLUSHALL takes away; True if it was not there."""
@@ -353,7 +365,7 @@ class Dispatcher:
 
     def workers(self) -> int:
         """Number of workers that announced themselves lately."""
-        return len(self._attempts.workers())
+        return len(self._attempts.presence.workers())
 
     def queued(self) -> int:
         """Number of tasks that wait, for a worker or for their parents."""
@@ -363,7 +375,7 @@ class Dispatcher:
     def metrics(self) -> dict[str, float]:
         """Numbers for those who watch this service, by name."""
         counts = self._attempts.counts()
-        workers = self._attempts.workers()
+        workers = self._attempts.presence.workers()
         return {
             "workers": len(workers),
             "workers_interactive": sum(worker.interactive for worker in workers),
