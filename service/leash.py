@@ -6,6 +6,7 @@ folder it stays as the command's parent, lets it end in peace, and removes the f
 do after ``kill -9`` of the supervisor.
 """
 
+import contextlib
 import ctypes
 import os
 import shutil
@@ -38,12 +39,17 @@ def keep(parent: int, folder: str, command: list[str]) -> int:
         hold(keeper, signal.SIGKILL)
         os.execv(command[0], command)
 
+    told = False
+
     def forward(number: int, frame: FrameType | None) -> None:
-        os.kill(child, signal.SIGTERM)
+        nonlocal told
+        told = True
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(child, signal.SIGTERM)
 
     def look(number: int, frame: FrameType | None) -> None:
         if os.getppid() != parent:
-            os.kill(child, signal.SIGTERM)
+            forward(number, frame)
 
     for number in blocked:
         signal.signal(number, forward)
@@ -52,7 +58,8 @@ def keep(parent: int, folder: str, command: list[str]) -> int:
     hold(parent, signal.SIGTERM)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, blocked)
     _, status = os.waitpid(child, 0)
-    if os.getppid() != parent:
+    # A command that died by itself may be started again with the same folder.
+    if told or os.getppid() != parent:
         shutil.rmtree(folder, ignore_errors=True)
     return os.waitstatus_to_exitcode(status)
 

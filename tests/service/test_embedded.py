@@ -80,6 +80,21 @@ def test_the_leash_ends_a_command_whose_supervisor_is_gone_already() -> None:
     assert done.returncode == -signal.SIGKILL
 
 
+def test_the_leash_removes_its_folder_only_when_told_to_end(tmp_path: Path) -> None:
+    folder = tmp_path / "sockets"
+    folder.mkdir()
+    died = subprocess.run(leashed("/bin/sh", "-c", "exit 3", folder=str(folder)), timeout=20, check=False)
+    assert died.returncode == 3
+    assert folder.is_dir()
+    process = subprocess.Popen(leashed("/bin/sleep", "60", folder=str(folder)))
+    until(lambda: like(of_folder(folder), "leash.py"))
+    # The command runs once the leash has a child.
+    until(lambda: Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text())
+    process.terminate()
+    assert process.wait(20) == signal.SIGTERM
+    assert not folder.exists()
+
+
 def test_a_killed_supervisor_takes_command_and_folder_along(tmp_path: Path) -> None:
     folder, mark = tmp_path / "sockets", "61.0625"
     folder.mkdir()
