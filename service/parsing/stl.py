@@ -31,7 +31,7 @@ def read(content: bytes, limits: Limits) -> Polygons:
     """
     announced = int.from_bytes(content[80:_HEADER_BYTES], "little") if len(content) >= _HEADER_BYTES else -1
     # The word "solid" decides nothing: many binary files begin with it.
-    if len(content) == _HEADER_BYTES + announced * _FACET.itemsize:
+    if announced >= 0 and len(content) == _HEADER_BYTES + announced * _FACET.itemsize:
         limits.check(0, announced)
         facets = np.frombuffer(content, dtype=_FACET, offset=_HEADER_BYTES)
         return _welded(np.ascontiguousarray(facets["corners"]).reshape(-1, 3), limits)

@@ -9,7 +9,6 @@ import subprocess
 import time
 
 import httpx
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -213,28 +212,25 @@ def test_a_client_that_leaves_is_no_longer_waited_on(idle: Service) -> None:
         until(lambda: idle.rooms.watch.waiting == 0)
 
 
-def test_a_hundred_waiters_do_not_slow_the_service(idle: Service) -> None:
-    async def story(service: Service, path: str) -> list[float]:
+def test_a_hundred_waiters_do_not_hold_up_the_service(idle: Service) -> None:
+    async def story(service: Service, path: str) -> None:
         limits = httpx.Limits(max_connections=200)
-        async with httpx.AsyncClient(base_url=service.url, timeout=30, limits=limits) as http:
-            waiting = [asyncio.create_task(http.get(f"{path}?wait=2")) for _ in range(100)]
+        async with httpx.AsyncClient(base_url=service.url, timeout=60, limits=limits) as http:
+            waiting = [asyncio.create_task(http.get(f"{path}?wait=50")) for _ in range(100)]
             while service.rooms.watch.waiting < 100:
                 await asyncio.sleep(0.01)
-            seconds = []
             for _ in range(20):
-                began = time.monotonic()
                 assert (await http.get("/healthz")).status_code == 200
-                seconds.append(time.monotonic() - began)
+            # All of that while not one of them had been let go.
+            assert service.rooms.watch.waiting == 100
+            assert (await http.delete(path)).status_code == 200
             answers = await asyncio.gather(*waiting)
-        assert {answer.json()["status"] for answer in answers} == {"accepted"}
-        return seconds
+        assert {answer.json()["status"] for answer in answers} == {"dismissed"}
 
     with idle.client() as http:
         mesh = http.post("/v1/meshes?format=off", content=sphere(1)).json()["id"]
         job = http.post("/v1/jobs", json=energy(mesh)).json()
-        seconds = asyncio.run(story(idle, job["links"]["self"]))
-        assert np.median(seconds) < 0.1
-        assert max(seconds) < 1.0
+        asyncio.run(story(idle, job["links"]["self"]))
 
 
 def test_the_same_question_from_many_at_once_is_one_job(

@@ -349,6 +349,7 @@ def test_damaged_files_are_read_or_refused_and_nothing_else(file_format: str, da
 @example("ply", b"ply\nformat ascii 1.0\nelement vertex " + b"9" * 5000 + b"\nend_header\n")
 @example("off", b"OFF\n" + b"9" * 5000 + b" 1 0\n")
 @example("obj", b"v 0 0 0\nf " + b"9" * 5000 + b" 1 1\n")
+@example("stl", b"\0" * 34)  # a header and a count short of nothing: 84 − 50 bytes
 def test_any_bytes_are_refused(file_format: str, content: bytes) -> None:
     refused(content, file_format)
 
