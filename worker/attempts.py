@@ -310,6 +310,10 @@ class Attempts:
 
     # Housekeeping
 
+    def due(self, what: str, seconds: int) -> bool:
+        """Whether something that is to happen every so many seconds should happen now; true for one asker."""
+        return bool(self.connection.set(self.key("done", what), 1, nx=True, ex=seconds))
+
     def uptime(self) -> int:
         """Seconds since Redis was started."""
         return int(self.connection.info("server")["uptime_in_seconds"])

@@ -56,6 +56,12 @@ def spec_named(id_: str, fields: dict[str, Any]) -> Spec | None:
     return spec if specs.spec_id(spec) == id_ else None
 
 
+def needs_of(record: JobRecord, known: Library) -> frozenset[str]:
+    """Ids of all that a job reads, shards included."""
+    spec = spec_named(record.id, record.spec)
+    return frozenset() if spec is None else frozenset(known.needs(spec) + planned_shards(record))
+
+
 def planned_shards(record: JobRecord | None) -> tuple[str, ...]:
     """Ids of the shards in a job's plan, in order."""
     if record is None or specs.KINDS[kind_of(record.id) or ""].private:

@@ -18,7 +18,7 @@ from worker import specs
 from worker.attempts import Attempts
 from worker.fields import SpecError, kind_of
 from worker.jobs import Job, Status, Task, Views
-from worker.library import Library, planned_shards, spec_named
+from worker.library import Library, needs_of
 from worker.plan import Node, Planner, planning
 from worker.questions import Graph, SpecTree, flatten
 from worker.settings import Settings
@@ -26,6 +26,7 @@ from worker.sizes import Sizes
 from worker.stages import flaws
 from worker.store import JobRecord, Store, UnknownJob, now
 from worker.store import cursor as cursor_of
+from worker.upkeep import keep_house
 
 __all__ = ["Busy", "Dismissal", "Dispatcher", "FinishedJob", "Job", "Task", "TooCostly", "UnknownJob"]
 
@@ -290,9 +291,9 @@ class Dispatcher:
         """A job and those of its ancestors that nobody else needs or asked for; empty if it is needed."""
         records = {record.id: record for record in self._store.open_jobs()}
         known = Library(self._store)
-        needs = {each: _needs(record, known) for each, record in records.items()}
+        needs = {each: needs_of(record, known) for each, record in records.items()}
         record = self._store.job(id_)
-        own = _needs(record, known) if record is not None else frozenset()
+        own = needs_of(record, known) if record is not None else frozenset()
         if any(id_ in needed for each, needed in needs.items() if each != id_):
             return []
         dropped = [id_]
@@ -332,6 +333,7 @@ class Dispatcher:
             If Redis is away; call again.
         """
         self._attempts.tidy()
+        keep_house(self._settings, self._store, self._attempts)
         records = list(self._store.open_jobs())
         if not records:
             self._remember_epoch()
@@ -385,9 +387,3 @@ class Dispatcher:
             "tasks_deferred": counts["deferred"],
             "jobs_open": sum(1 for _ in self._store.open_jobs()),
         }
-
-
-def _needs(record: JobRecord, known: Library) -> frozenset[str]:
-    """Ids of all that a job reads, shards included."""
-    spec = spec_named(record.id, record.spec)
-    return frozenset() if spec is None else frozenset(known.needs(spec) + planned_shards(record))

@@ -96,7 +96,7 @@ class Workplace:
             retry=Retry(NoBackoff(), 0),
         )
         self.attempts = Attempts(self.connection, self.store.identity, specs.versions_digest())
-        self.threads = settings.threads or len(os.sched_getaffinity(0))
+        self.threads = settings.threads or usable_cores()
 
     def prepare(self) -> None:
         """Load what every task needs, before the worker forks; nothing of it is run, no thread is begun."""
@@ -293,6 +293,11 @@ def memory(task: str, limit: int) -> Problem:
 def _words(error: Exception) -> str:
     """What a fault is, without the paths that only this machine's owner may see."""
     return (error.strerror if isinstance(error, OSError) else None) or type(error).__name__
+
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @cache

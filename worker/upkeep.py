@@ -1,49 +1,49 @@
-"""Keeping the store small: what dead writers left goes, and what nobody reads once there is too much."""
+"""Keeping the store within its bounds: what is forgotten, what is cleared away, and how often."""
 
 from __future__ import annotations
 
 import logging
+from typing import Final
 
-from worker.library import Library, planned_shards, spec_named
+from worker.attempts import Attempts
+from worker.library import Library, needs_of
+from worker.plan import planning
 from worker.settings import Settings
 from worker.store import Store
 
-_log = logging.getLogger("softmaps.upkeep")
+_log = logging.getLogger("softmaps.queue")
+
+#: Seconds between two looks at the size of the store, and between two sweeps of what dead writers left.
+EVICT_SECONDS: Final = 60
+SWEEP_SECONDS: Final = 3600
 
 
-def tidy(store: Store, settings: Settings) -> tuple[str, ...]:
-    """Remove what dead writers left and, above ``store_max_bytes``, forget what was least recently read.
+def keep_house(settings: Settings, store: Store, attempts: Attempts) -> None:
+    """Forget what the store has no room for, and sweep it, each when it is time; one process at a time.
 
-    Uploads stay, and so does everything that an unfinished job reads. What is forgotten answers 410 with the
-    spec that makes it again.
+    What open jobs read is never forgotten, nor are uploads.
 
     Parameters
     ----------
-    store : Store
     settings : Settings
-
-    Returns
-    -------
-    tuple of str
-        Ids of what was forgotten.
-
-    Raises
-    ------
-    OSError
-        If the store cannot be read or written.
+    store : Store
+    attempts : Attempts
     """
-    swept = store.sweep()
-    if swept.blobs or swept.files:
-        _log.info("removed %d blobs and %d files of writers that died", swept.blobs, swept.files)
-    if settings.store_max_bytes is None:
-        return ()
+    if settings.store_max_bytes is not None and attempts.due("evict", EVICT_SECONDS):
+        # Under the lock: nobody may plan with what is being forgotten.
+        with planning(attempts, 0.0) as held:
+            if held:
+                forgotten = store.evict(settings.store_max_bytes, _needed(store))
+                if forgotten:
+                    _log.info(
+                        "forgot %d results to stay within %d bytes", len(forgotten), settings.store_max_bytes
+                    )
+    if attempts.due("sweep", SWEEP_SECONDS):
+        swept = store.sweep()
+        _log.info("swept %d blobs, %d files, %d jobs", swept.blobs, swept.files, swept.jobs)
+
+
+def _needed(store: Store) -> frozenset[str]:
+    """Ids that open jobs read."""
     known = Library(store)
-    live: set[str] = set()
-    for record in store.open_jobs():
-        spec = spec_named(record.id, record.spec)
-        if spec is not None:
-            live.update(known.needs(spec) + planned_shards(record))
-    forgotten = store.evict(settings.store_max_bytes, live)
-    if forgotten:
-        _log.info("forgot %d artifacts that were least recently read", len(forgotten))
-    return forgotten
+    return frozenset().union(*(needs_of(record, known) for record in store.open_jobs()))

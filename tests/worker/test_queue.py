@@ -255,6 +255,20 @@ def test_an_evicted_parent_of_an_open_job_is_made_again(
     assert dispatcher.job(job.id).status == "successful"  # type: ignore[union-attr]
 
 
+def test_a_full_store_forgets_what_no_open_job_reads(
+    settings: Settings, store: Store, connection: redis.Redis, place: Workplace, mesh: str
+) -> None:
+    tight = Dispatcher(settings.model_copy(update={"store_max_bytes": 0}), store, connection)
+    for size in (20, 21):
+        run(place, ask(tight, kind="basis", mesh=mesh, size=size))
+    needed = ask(tight, **energy(mesh, 20))
+    tight.reconcile()
+    assert [(one.kind, one.spec["size"]) for one in store.manifests("basis") if one.spec] == [("basis", 20)]
+    assert store.has(mesh)
+    run(place, needed)
+    assert store.has(needed.id)
+
+
 def test_reconciling_brings_a_wiped_redis_back(
     dispatcher: Dispatcher, connection: redis.Redis, mesh: str
 ) -> None:

@@ -303,6 +303,7 @@ def test_a_worker_does_all_this_in_a_process_of_its_own(
     """A real worker: an energy, a refused job, and callbacks that are never called."""
     mesh = put_mesh(store, grid())
     workers.start()
+    quick = workers.start("--interactive")
     witness = tmp_path / "witness"
     queue = dispatcher._attempts.queues["batch"]
     forbidden = queue.enqueue_call(
@@ -318,7 +319,11 @@ def test_a_worker_does_all_this_in_a_process_of_its_own(
     assert not witness.exists()
     assert called.get_status() == "finished"
     assert "is no task" in (forbidden.latest_result().exc_string or "")
-    assert dispatcher.workers() == 1
+    assert dispatcher.workers() == 2
+    assert dispatcher.metrics()["workers_interactive"] == 1
+    quick.terminate()
+    assert quick.wait(10) == 0
+    until(lambda: dispatcher.workers() == 1)
 
 
 def test_what_needs_too_much_memory_fails_and_the_worker_goes_on(
