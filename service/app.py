@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import importlib.metadata
 import logging
-import math
 import secrets
 import threading
 import time
@@ -34,12 +33,9 @@ from service.watch import Watch
 from worker.queue import Dispatcher
 from worker.settings import Settings
 from worker.store import Store
-from worker.upkeep import tidy
 
 #: Seconds between two passes of the loop that recovers lost work.
 RECONCILE_SECONDS = 3.0
-#: Seconds between two looks for what the store may forget.
-TIDY_SECONDS = 60.0
 #: Redis answers within this many seconds or counts as away.
 REDIS_SECONDS = 5.0
 #: What anybody may ask without a token: whether the service lives.
@@ -109,7 +105,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     rooms: Rooms = app.state.rooms
     await app.state.nursery.start()
     stop = threading.Event()
-    work = (rooms, stop)
+    work = (rooms.dispatcher, stop)
     reconciler = threading.Thread(target=_reconcile, args=work, name="reconcile", daemon=True)
     reconciler.start()
     try:
@@ -122,14 +118,10 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.state.connection.close()
 
 
-def _reconcile(rooms: Rooms, stop: threading.Event) -> None:
-    tidied = -math.inf
+def _reconcile(dispatcher: Dispatcher, stop: threading.Event) -> None:
     while not stop.wait(RECONCILE_SECONDS):
         try:
-            rooms.dispatcher.reconcile()
-            if time.monotonic() - tidied > TIDY_SECONDS:
-                tidied = time.monotonic()
-                tidy(rooms.store, rooms.settings)
+            dispatcher.reconcile()
         except redis.exceptions.RedisError as error:
             log.warning("Redis is away, nothing is recovered: %s", error)
         except Exception:

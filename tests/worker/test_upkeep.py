@@ -10,7 +10,6 @@ from worker.queue import Dispatcher
 from worker.settings import Settings
 from worker.store import Store
 from worker.tasks import Workplace
-from worker.upkeep import tidy
 
 
 def made(dispatcher: Dispatcher, place: Workplace, store: Store) -> str:
@@ -19,22 +18,25 @@ def made(dispatcher: Dispatcher, place: Workplace, store: Store) -> str:
     return finished(dispatcher, job.id).id
 
 
+def reconciled(settings: Settings, store: Store, connection: redis.Redis, most: int | None) -> None:
+    Dispatcher(settings.model_copy(update={"store_max_bytes": most}), store, connection).reconcile()
+
+
 def test_without_a_limit_nothing_is_forgotten(
-    dispatcher: Dispatcher, place: Workplace, store: Store, settings: Settings
+    dispatcher: Dispatcher, place: Workplace, store: Store, settings: Settings, connection: redis.Redis
 ) -> None:
     answer = made(dispatcher, place, store)
-    assert tidy(store, settings) == ()
+    reconciled(settings, store, connection, most=None)
     assert store.has(answer)
 
 
 def test_results_go_before_uploads_and_can_be_asked_for_again(
-    dispatcher: Dispatcher, place: Workplace, store: Store, settings: Settings
+    dispatcher: Dispatcher, place: Workplace, store: Store, settings: Settings, connection: redis.Redis
 ) -> None:
     answer = made(dispatcher, place, store)
-    forgotten = tidy(store, settings.model_copy(update={"store_max_bytes": 0}))
-    assert answer in forgotten
-    assert not any(id_.startswith(("mesh", "array")) for id_ in forgotten)
+    reconciled(settings, store, connection, most=0)
     assert store.gone(answer) is not None
+    assert {manifest.kind for manifest in store.manifests()} <= {"mesh", "array"}
     assert made(dispatcher, place, store) == answer
     assert store.has(answer)
 
@@ -45,7 +47,7 @@ def test_what_an_unfinished_job_reads_stays(
     answer = made(dispatcher, place, store)
     softmap = store.manifest(answer).parents["softmap"]
     waiting = ask(dispatcher, kind="energy", softmap=softmap, regularisation=1e-3)
-    forgotten = tidy(store, settings.model_copy(update={"store_max_bytes": 0}))
-    assert forgotten == (answer,)
+    reconciled(settings, store, connection, most=0)
+    assert store.gone(answer) is not None
     run(place, waiting)
     assert store.has(waiting.id)
