@@ -16,10 +16,11 @@ from scipy import sparse
 from solver.basis import Basis
 from solver.cholesky import ENTRIES, FLOATS, INTEGERS, PANELS, Entries, kernel, types
 from solver.errors import SolverError
+from solver.fem import hat_gradients
 from solver.mesh import FloatArray, IntArray
 from solver.softmap import SoftMap
 from solver.symbolic import Panels, Symbolic, analyse
-from solver.tensor import TargetTensor, face_gradients, target_tensor
+from solver.tensor import TargetTensor, target_tensor
 
 #: Entries of A assembled at once, so that one load of c̃ⱼ serves all of them.
 GROUP = 4
@@ -37,7 +38,9 @@ class Tensor(NamedTuple):
     value : ndarray of float64, shape (·, 4)
         Wⱼ at the group's four entries.
     row, column : ndarray of int64, shape (4 G,)
-        The entries, group by group; the last group is filled up with zeros at (0, 0).
+        The entries, group by group, in about the order of the panels; zeros at (0, 0) fill up the last group.
+    diagonal : ndarray of int64, shape (n,)
+        Where the diagonal stands among the entries.
     """
 
     start: IntArray
@@ -45,23 +48,6 @@ class Tensor(NamedTuple):
     value: FloatArray
     row: IntArray
     column: IntArray
-
-
-class Neighbours(NamedTuple):
-    """Both triangles of the pattern, row by row.
-
-    Attributes
-    ----------
-    start : ndarray of int64, shape (n + 1,)
-    column, entry : ndarray of int64, shape (·,)
-        Column of each nonzero, and where it stands among the entries.
-    diagonal : ndarray of int64, shape (n,)
-        Where the diagonal stands among the entries.
-    """
-
-    start: IntArray
-    column: IntArray
-    entry: IntArray
     diagonal: IntArray
 
 
@@ -73,7 +59,6 @@ class Target(NamedTuple):
     panels : Panels
     entries : Entries
     tensor : Tensor
-    neighbours : Neighbours
     integrals : ndarray of float64, shape (1, n)
         ∫βⱼ; here, in C and in CU, n is rounded up to an even number by a column of zeros.
     """
@@ -81,7 +66,6 @@ class Target(NamedTuple):
     panels: Panels
     entries: Entries
     tensor: Tensor
-    neighbours: Neighbours
     integrals: FloatArray
 
 
@@ -90,26 +74,31 @@ class Source(NamedTuple):
 
     Attributes
     ----------
-    start : ndarray of int64, shape (F₀ + 1,)
-        Where each face's functions start.
+    corner : ndarray of int64, shape (3 F₀,)
+        Corners of each face.
+    slope : ndarray of float64, shape (3 F₀, 2)
+        ⟨∇₀λ, V_f^s⟩ of the hat function of each corner.
+    start : ndarray of int64, shape (V₀ + 1,)
+        Where each vertex's functions start.
     function : ndarray of int64, shape (nnz,)
-    slope : ndarray of float64, shape (nnz, 3)
-        mean_f(β₀ᵢ) and g_fs[i] = ⟨∇₀β₀ᵢ|_f, V_f^s⟩ for s = 1, 2.
+    value : ndarray of float64, shape (1, nnz)
+        β₀ᵢ at the vertex.
     coefficients, received : ndarray of float64, shape (n₀, n)
         C and CU.
     """
 
+    corner: IntArray
+    slope: FloatArray
     start: IntArray
     function: IntArray
-    slope: FloatArray
+    value: FloatArray
     coefficients: FloatArray
     received: FloatArray
 
 
-TENSOR = types.NamedTuple([INTEGERS, INTEGERS, FLOATS, INTEGERS, INTEGERS], Tensor)
-NEIGHBOURS = types.NamedUniTuple(INTEGERS, len(Neighbours._fields), Neighbours)
-TARGET = types.NamedTuple([PANELS, ENTRIES, TENSOR, NEIGHBOURS, FLOATS], Target)
-SOURCE = types.NamedTuple([INTEGERS, INTEGERS, FLOATS, FLOATS, FLOATS], Source)
+TENSOR = types.NamedTuple([INTEGERS, INTEGERS, FLOATS, INTEGERS, INTEGERS, INTEGERS], Tensor)
+TARGET = types.NamedTuple([PANELS, ENTRIES, TENSOR, FLOATS], Target)
+SOURCE = types.NamedTuple([INTEGERS, FLOATS, INTEGERS, INTEGERS, FLOATS, FLOATS, FLOATS], Source)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +127,7 @@ class Systems:
     plan : Plan
     source : Source
     widest : int
-        Most functions on a face of the source.
+        Bound on the functions that live on a face of the source.
     """
 
     softmap: SoftMap
@@ -176,18 +165,18 @@ def systems(softmap: SoftMap, regularisation: float) -> Systems:
         raise SolverError(message, value=float(regularisation))
     plan = plan_of(softmap.target)
     order = plan.symbolic.order
-    gradients = face_gradients(softmap.source)
-    counts = np.diff(gradients.start)
-    frames = np.repeat(softmap.source.mesh.frames, counts, axis=0)
-    slopes = np.einsum("esx,ex->es", frames, gradients.vectors)
+    mesh, functions = softmap.source.mesh, softmap.source.functions
     source = Source(
-        start=gradients.start,
-        function=gradients.functions,
-        slope=np.column_stack([gradients.means, slopes]),
+        corner=mesh.faces.ravel().astype(np.int64),
+        slope=np.einsum("fcx,fsx->fcs", hat_gradients(mesh), mesh.frames).reshape(-1, 2),
+        start=functions.indptr.astype(np.int64),
+        function=functions.indices.astype(np.int64),
+        value=np.array(functions.data, dtype=np.float64, ndmin=2),
         coefficients=_even(softmap.coefficients[:, order]),
         received=_even((softmap.coefficients @ softmap.target.overlap)[:, order]),
     )
-    return Systems(softmap, float(regularisation), plan, source, int(counts.max()))
+    widest = int(np.diff(functions.indptr)[mesh.faces].sum(axis=1).max())
+    return Systems(softmap, float(regularisation), plan, source, widest)
 
 
 def plan_of(basis: Basis) -> Plan:
@@ -218,20 +207,10 @@ def _plan(basis: Basis) -> Plan:
         (np.ones(tensor.rows.size), (tensor.rows, tensor.columns)), shape=(basis.size,) * 2
     )
     symbolic = analyse(sparse.csr_array(pattern + pattern.T))
-    place = np.argsort(symbolic.order)
-    a, b = place[tensor.rows], place[tensor.columns]
-    grouped, rows, columns = _grouped(tensor, symbolic.order, np.maximum(a, b), np.minimum(a, b))
-    n_entries = tensor.rows.size
-    return Plan(
-        symbolic,
-        Target(
-            panels=symbolic.panels,
-            entries=_entries(symbolic, rows[:n_entries], columns[:n_entries]),
-            tensor=grouped,
-            neighbours=_neighbours(rows[:n_entries], columns[:n_entries], basis.size),
-            integrals=_even(basis.integrals[symbolic.order][None, :]),
-        ),
-    )
+    grouped = _grouped(tensor, symbolic)
+    integrals = _even(basis.integrals[symbolic.order][None, :])
+    entries = _entries(symbolic, grouped.row[: tensor.rows.size], grouped.column[: tensor.rows.size])
+    return Plan(symbolic, Target(symbolic.panels, entries, grouped, integrals))
 
 
 def _even(columns: FloatArray) -> FloatArray:
@@ -239,27 +218,39 @@ def _even(columns: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.pad(columns, [(0, 0), (0, columns.shape[1] % 2)]))
 
 
-def _grouped(
-    tensor: TargetTensor, order: IntArray, rows: IntArray, columns: IntArray
-) -> tuple[Tensor, IntArray, IntArray]:
-    """W in groups of entries that share most of their terms; rows and columns in the order of the groups."""
-    values = sparse.csr_array(tensor.values[:, order])
+def _grouped(tensor: TargetTensor, symbolic: Symbolic) -> Tensor:
+    """W in groups of entries that share most of their terms, in the order of elimination."""
+    n = symbolic.order.size
+    place = np.argsort(symbolic.order)
+    a, b = place[tensor.rows], place[tensor.columns]
+    rows, columns = np.maximum(a, b), np.minimum(a, b)
+    values = sparse.csr_array(tensor.values[:, symbolic.order])
     values.sort_indices()
-    at = _neighbours(rows, columns, order.size)
     chosen = _groups(
-        values.indptr.astype(np.int64), values.indices.astype(np.int64), rows, columns, at.start, at.entry
+        values.indptr.astype(np.int64),
+        values.indices.astype(np.int64),
+        rows,
+        columns,
+        *_near(rows, columns, n),
     )
+    # Groups in the order of their first column, so that what panels read one after the other lies together.
+    whole = chosen[: chosen.size // GROUP * GROUP].reshape(-1, GROUP)
+    sort = np.argsort(columns[whole].min(axis=1), kind="stable")
+    chosen = np.concatenate([whole[sort].ravel(), chosen[whole.size :]])
+
     padding = -chosen.size % GROUP
     group = np.repeat(np.arange((chosen.size + padding) // GROUP), GROUP)[: chosen.size]
     taken = values[chosen].tocoo()
-    keys = group[taken.row] * order.size + taken.col
-    terms, term = np.unique(keys, return_inverse=True)
+    terms, term = np.unique(group[taken.row] * n + taken.col, return_inverse=True)
     value = np.zeros((terms.size, GROUP))
     value[term, taken.row % GROUP] = taken.data
-    of_group, function = np.divmod(terms, order.size)
+    of_group, function = np.divmod(terms, n)
     start = np.searchsorted(of_group, np.arange(group[-1] + 2)).astype(np.int64)
-    rows, columns = (np.pad(these[chosen], (0, padding)) for these in (rows, columns))
-    return Tensor(start, function.astype(np.int64), value, rows, columns), rows, columns
+    rows, columns = rows[chosen], columns[chosen]
+    diagonal = np.empty(n, dtype=np.int64)
+    diagonal[rows[rows == columns]] = np.flatnonzero(rows == columns)
+    rows, columns = np.pad(rows, (0, padding)), np.pad(columns, (0, padding))
+    return Tensor(start, function.astype(np.int64), value, rows, columns, diagonal)
 
 
 @kernel(INTEGERS(INTEGERS, INTEGERS, INTEGERS, INTEGERS, INTEGERS, INTEGERS))
@@ -310,14 +301,10 @@ def _entries(symbolic: Symbolic, rows: IntArray, columns: IntArray) -> Entries:
     return Entries(start.astype(np.int64), entry.astype(np.int64), cells[entry].astype(np.int64))
 
 
-def _neighbours(rows: IntArray, columns: IntArray, n: int) -> Neighbours:
+def _near(rows: IntArray, columns: IntArray, n: int) -> tuple[IntArray, IntArray]:
+    """Entries of each row of the full pattern: where each row's start, and the entries."""
     below = np.flatnonzero(rows != columns)
     row = np.concatenate([rows, columns[below]])
-    column = np.concatenate([columns, rows[below]])
-    entry = np.concatenate([np.arange(rows.size), below])
-    sort = np.lexsort((column, row))
+    sort = np.argsort(row, kind="stable")
     start = np.searchsorted(row[sort], np.arange(n + 1)).astype(np.int64)
-    on_diagonal = np.flatnonzero(rows == columns)
-    diagonal = np.empty(n, dtype=np.int64)
-    diagonal[rows[on_diagonal]] = on_diagonal
-    return Neighbours(start, column[sort], entry[sort], diagonal)
+    return start, np.concatenate([np.arange(rows.size), below])[sort]

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from solver.assembly import NEIGHBOURS, SOURCE, TARGET, TENSOR, Systems
-from solver.cholesky import FACTOR, FLOATS, INTEGERS, Factor, factor_lanes, kernel, solve_lanes, types
+from solver.assembly import SOURCE, TARGET, TENSOR, Systems
+from solver.cholesky import FACTOR, FLOATS, INTEGERS, Factor, kernel, solve_lanes, types
 from solver.lanes import (
     LANES,
     absolute,
@@ -53,8 +53,10 @@ class Work(NamedTuple):
         b and q likewise, the two directions side by side.
     diagonal : (n, LANES)
         Diagonal of A, doubled where a face is grounded.
-    weights : (3 m, LANES)
-        Mean and slopes of each of the m functions that live on some faces.
+    rest : (3n, LANES)
+        Aq − b in both directions, and sums of the rows of |A|.
+    weights : (GROUPS · 3 m, LANES)
+        mean_f(β₀ᵢ), g_f1[i], g_f2[i] of each of at most m source functions that live on a group's faces.
     summary : (GROUPS · 3, LANES)
         Heaviest function, energy density, residual.
     """
@@ -66,6 +68,7 @@ class Work(NamedTuple):
     right: FloatArray
     x: FloatArray
     diagonal: FloatArray
+    rest: FloatArray
     weights: FloatArray
     summary: FloatArray
 
@@ -77,11 +80,15 @@ class Slots(NamedTuple):
     ----------
     of : ndarray of int64, shape (n₀,)
         −1 between batches.
-    active : ndarray of int64, shape (m,)
+    active : ndarray of int64, shape (GROUPS · m,)
+        Those of each group of lanes, ascending.
+    counts : ndarray of int64, shape (GROUPS,)
+        How many they are.
     """
 
     of: IntArray
     active: IntArray
+    counts: IntArray
 
 
 class Bench(NamedTuple):
@@ -97,8 +104,8 @@ class Gradient(NamedTuple):
 
     Attributes
     ----------
-    line : ndarray of int64, shape (nnz of the chunk,)
-        Row below of each function on each face.
+    line : ndarray of int64, shape (n₀,), or (0,) if there is nothing to sum
+        Row below of each source function that lives on the faces.
     area : ndarray of float64, shape (1, faces)
     slopes : ndarray of float64, shape (m, n)
         Σ_fs area₀ g_fs q_fsᵀ.
@@ -140,47 +147,66 @@ def bench(systems: Systems) -> Bench:
     target = systems.plan.target
     n = target.integrals.size
     active = min(len(systems.source.coefficients), LANES * systems.widest)
-    sizes = [GROUPS * target.tensor.row.size, *[GROUPS * n] * 3, *[GROUPS * 2 * n] * 2, n, 3 * active]
     return Bench(
-        Work(*(empty_lanes(size) for size in sizes), empty_lanes(3 * GROUPS)),
+        Work(
+            matrix=empty_lanes(GROUPS * target.tensor.row.size),
+            blended=empty_lanes(GROUPS * n),
+            forms=empty_lanes(GROUPS * n),
+            means=empty_lanes(GROUPS * n),
+            right=empty_lanes(GROUPS * 2 * n),
+            x=empty_lanes(GROUPS * 2 * n),
+            diagonal=empty_lanes(n),
+            rest=empty_lanes(3 * n),
+            weights=empty_lanes(GROUPS * 3 * active),
+            summary=empty_lanes(GROUPS * 3),
+        ),
         Factor(empty_lanes(int(target.panels.start[-1])), empty_lanes(n), empty_lanes(2)),
-        Slots(np.full(len(systems.source.coefficients), -1), np.empty(active, dtype=np.int64)),
+        Slots(
+            np.full(len(systems.source.coefficients), -1),
+            np.empty(GROUPS * active, dtype=np.int64),
+            np.zeros(GROUPS, dtype=np.int64),
+        ),
     )
 
 
-@kernel(types.int64(SOURCE, INTEGERS, types.int64, FLOATS, SLOTS))
-def _gather(source, faces, first, weights, slots):  # type: ignore[no-untyped-def]
-    """Functions of a batch of faces, ascending, and their weights; the last face fills spare lanes."""
-    count, active = 0, slots.active
+@kernel(types.int64(SOURCE, INTEGERS, types.int64, FLOATS, INTEGERS, INTEGERS))
+def _gather(source, faces, first, weights, slot, active):  # type: ignore[no-untyped-def]
+    """Functions of some faces, ascending, with mean_f(β₀) and g_fs; the last face fills spare lanes."""
+    count = 0
     for lane in range(LANES):
         face = faces[min(first + lane, faces.size - 1)]
-        for k in range(source.start[face], source.start[face + 1]):
-            function = source.function[k]
-            if slots.of[function] < 0:
-                slots.of[function] = 0
-                slot = count
-                while slot > 0 and active[slot - 1] > function:
-                    active[slot] = active[slot - 1]
-                    slot -= 1
-                active[slot] = function
-                count += 1
-    for slot in range(count):
-        slots.of[active[slot]] = slot
+        for corner in range(3 * face, 3 * face + 3):
+            vertex = source.corner[corner]
+            for k in range(source.start[vertex], source.start[vertex + 1]):
+                function = source.function[k]
+                if slot[function] < 0:
+                    slot[function] = 0
+                    place = count
+                    while place > 0 and active[place - 1] > function:
+                        active[place] = active[place - 1]
+                        place -= 1
+                    active[place] = function
+                    count += 1
+    for place in range(count):
+        slot[active[place]] = place
     for row in range(3 * count):
         store(weights, row, splat(0.0))
     for lane in range(LANES):
         face = faces[min(first + lane, faces.size - 1)]
-        for k in range(source.start[face], source.start[face + 1]):
-            row = 3 * slots.of[source.function[k]]
-            for s in range(3):
-                weights[row + s, lane] = source.slope[k, s]
-    for slot in range(count):
-        slots.of[active[slot]] = -1
+        for corner in range(3 * face, 3 * face + 3):
+            vertex = source.corner[corner]
+            for k in range(source.start[vertex], source.start[vertex + 1]):
+                row, value = 3 * slot[source.function[k]], source.value[0, k]
+                weights[row, lane] += value / 3
+                weights[row + 1, lane] += value * source.slope[corner, 0]
+                weights[row + 2, lane] += value * source.slope[corner, 1]
+    for place in range(count):
+        slot[active[place]] = -1
     return count
 
 
-@kernel(types.void(SOURCE, FLOATS, types.float64, types.int64, INTEGERS, WORK, types.int64))
-def _mix(source, integrals, regularisation, count, active, work, group):  # type: ignore[no-untyped-def]
+@kernel(types.void(SOURCE, FLOATS, types.float64, INTEGERS, FLOATS, WORK, types.int64))
+def _mix(source, integrals, regularisation, active, weights, work, group):  # type: ignore[no-untyped-def]
     """c̃ = (1−ε) Cᵀ mean(β₀) + ε ∫β, u = (1−ε) (CU)ᵀ mean(β₀) + ε ∫β, b_s = (1−ε) (CU)ᵀ g_s, argmax c."""
     n = integrals.shape[1]
     keep = splat(1 - regularisation)
@@ -188,9 +214,8 @@ def _mix(source, integrals, regularisation, count, active, work, group):  # type
     for j in range(0, n, 2):
         c, u, b0, b1 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
         d, v, e0, e1 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
-        for k in range(count):
-            mean, slope = load(work.weights, 3 * k), load(work.weights, 3 * k + 1)
-            slope1 = load(work.weights, 3 * k + 2)
+        for k in range(active.size):
+            mean, slope, slope1 = load(weights, 3 * k), load(weights, 3 * k + 1), load(weights, 3 * k + 2)
             row = source.coefficients[active[k]]
             c, d = add_product(splat(row[j]), mean, c), add_product(splat(row[j + 1]), mean, d)
             row = source.received[active[k]]
@@ -236,7 +261,7 @@ def _project(means, right):  # type: ignore[no-untyped-def]
 @kernel(types.void(TENSOR, FLOATS, FLOATS))
 def _assemble(tensor, blended, matrix):  # type: ignore[no-untyped-def]
     """A = Σⱼ c̃ⱼ Wⱼ for all four groups of lanes, so that W is read once for them."""
-    start, function, value, rows, _ = tensor
+    start, function, value, rows = tensor.start, tensor.function, tensor.value, tensor.row
     n = rows.size
     for group in range(start.size - 1):
         a0, a1, a2, a3 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
@@ -289,27 +314,42 @@ def _shift(means, x):  # type: ignore[no-untyped-def]
         store(x, 2 * k + 1, subtract(load(x, 2 * k + 1), second))
 
 
-@kernel(types.void(NEIGHBOURS, FLOATS, FLOATS, FLOATS, FLOATS))
-def _measure(near, matrix, right, x, summary):  # type: ignore[no-untyped-def]
+@kernel(types.void(TENSOR, FLOATS, FLOATS, FLOATS, FLOATS, FLOATS))
+def _measure(tensor, matrix, right, x, rest, summary):  # type: ignore[no-untyped-def]
     """Density Σ_s b_s · q_s, and residual ‖Aq−b‖∞ / (‖A‖∞‖q‖∞ + ‖b‖∞)."""
     zero = splat(0.0)
+    n = len(right) // 2
+    for row in range(n):
+        store(rest, 3 * row, load(right, 2 * row))
+        store(rest, 3 * row + 1, load(right, 2 * row + 1))
+        store(rest, 3 * row + 2, zero)
+    for k in range(tensor.row.size):
+        row, column = tensor.row[k], tensor.column[k]
+        entry = load(matrix, k)
+        size = absolute(entry)
+        at, other = 3 * row, 2 * column
+        store(rest, at, subtract_product(entry, load(x, other), load(rest, at)))
+        store(rest, at + 1, subtract_product(entry, load(x, other + 1), load(rest, at + 1)))
+        store(rest, at + 2, add(size, load(rest, at + 2)))
+        if row != column:
+            at, other = 3 * column, 2 * row
+            store(rest, at, subtract_product(entry, load(x, other), load(rest, at)))
+            store(rest, at + 1, subtract_product(entry, load(x, other + 1), load(rest, at + 1)))
+            store(rest, at + 2, add(size, load(rest, at + 2)))
     density, size = zero, zero
     q0, b0, off0 = zero, zero, zero
     q1, b1, off1 = zero, zero, zero
-    for row in range(near.diagonal.size):
-        rest0, rest1 = load(right, 2 * row), load(right, 2 * row + 1)
-        own0, own1 = load(x, 2 * row), load(x, 2 * row + 1)
-        density = add_product(rest1, own1, add_product(rest0, own0, density))
-        q0, q1 = larger(q0, absolute(own0)), larger(q1, absolute(own1))
-        b0, b1 = larger(b0, absolute(rest0)), larger(b1, absolute(rest1))
-        line = zero
-        for k in range(near.start[row], near.start[row + 1]):
-            entry, column = load(matrix, near.entry[k]), 2 * near.column[k]
-            rest0 = subtract_product(entry, load(x, column), rest0)
-            rest1 = subtract_product(entry, load(x, column + 1), rest1)
-            line = add(line, absolute(entry))
-        size = larger(size, line)
-        off0, off1 = larger(off0, absolute(rest0)), larger(off1, absolute(rest1))
+    for row in range(n):
+        x0, x1 = load(x, 2 * row), load(x, 2 * row + 1)
+        right0, right1 = load(right, 2 * row), load(right, 2 * row + 1)
+        density = add_product(right1, x1, add_product(right0, x0, density))
+        q0, q1 = larger(q0, absolute(x0)), larger(q1, absolute(x1))
+        b0, b1 = larger(b0, absolute(right0)), larger(b1, absolute(right1))
+        off0, off1 = (
+            larger(off0, absolute(load(rest, 3 * row))),
+            larger(off1, absolute(load(rest, 3 * row + 1))),
+        )
+        size = larger(size, load(rest, 3 * row + 2))
     scale0, scale1 = add_product(size, q0, b0), add_product(size, q1, b1)
     worst = where_above(scale0, zero, divide(off0, scale0), off0)
     worst = larger(worst, where_above(scale1, zero, divide(off1, scale1), off1))
@@ -330,7 +370,7 @@ def _multiply(tensor, x, products):  # type: ignore[no-untyped-def]
 @kernel(types.void(TENSOR, FLOATS, FLOATS))
 def _quadratic_forms(tensor, products, forms):  # type: ignore[no-untyped-def]
     """Σ_s q_sᵀ Wⱼ q_s for every j: the transpose of the assembly, for all four groups of lanes."""
-    start, function, value, rows, _ = tensor
+    start, function, value, rows = tensor.start, tensor.function, tensor.value, tensor.row
     n = rows.size
     for row in range(len(forms)):
         store(forms, row, splat(0.0))
@@ -358,8 +398,8 @@ def _quadratic_forms(tensor, products, forms):  # type: ignore[no-untyped-def]
             store_four(forms, row, f0, f1, f2, f3)
 
 
-@kernel(types.void(SOURCE, FLOATS, FLOATS, types.int64, types.int64, types.int64, types.float64, GRADIENT))
-def _accumulate(source, x, forms, lane, face, at, area, gradient):  # type: ignore[no-untyped-def]
+@kernel(types.void(FLOATS, INTEGERS, FLOATS, FLOATS, types.int64, types.float64, GRADIENT))
+def _accumulate(weights, active, x, forms, lane, area, gradient):  # type: ignore[no-untyped-def]
     """Add one face to the sums of the gradient; `forms` starts at the face's group of lanes."""
     n = gradient.slopes.shape[1]
     first, second, form = np.empty(n), np.empty(n), np.empty(n)
@@ -367,9 +407,12 @@ def _accumulate(source, x, forms, lane, face, at, area, gradient):  # type: igno
         first[k] = area * x[2 * k, lane]
         second[k] = area * x[2 * k + 1, lane]
         form[k] = area * forms[GROUPS * k, lane]
-    for k in range(source.start[face], source.start[face + 1]):
-        line = gradient.line[at + k - source.start[face]]
-        mean, slope, slope1 = source.slope[k, 0], source.slope[k, 1], source.slope[k, 2]
+    for k in range(active.size):
+        mean = weights[3 * k, lane]
+        if mean == 0:  # a function of another face
+            continue
+        slope, slope1 = weights[3 * k + 1, lane], weights[3 * k + 2, lane]
+        line = gradient.line[active[k]]
         slopes, sums = gradient.slopes[line], gradient.forms[line]
         for j in range(n):
             slopes[j] += slope * first[j] + slope1 * second[j]
@@ -414,11 +457,14 @@ def solve_faces(  # type: ignore[no-untyped-def]
     """
     work, factor, slots = bench
     n, n_entries = target.integrals.size, target.tensor.row.size
-    at = 0
+    most = len(work.weights) // (3 * GROUPS)
     for begin in range(0, faces.size, GROUPS * LANES):
         for group in range(GROUPS):
-            count = _gather(source, faces, begin + group * LANES, work.weights, slots)
-            _mix(source, target.integrals, regularisation, count, slots.active, work, group)
+            weights = work.weights[3 * most * group : 3 * most * (group + 1)]
+            active = slots.active[most * group : most * (group + 1)]
+            count = _gather(source, faces, begin + group * LANES, weights, slots.of, active)
+            slots.counts[group] = count
+            _mix(source, target.integrals, regularisation, active[:count], weights, work, group)
         _assemble(target.tensor, work.blended, work.matrix)
         for group in range(GROUPS):
             first = begin + group * LANES
@@ -430,14 +476,13 @@ def solve_faces(  # type: ignore[no-untyped-def]
             right = work.right[group * 2 * n : (group + 1) * 2 * n]
             x = work.x[group * 2 * n : (group + 1) * 2 * n]
             summary = work.summary[3 * group : 3 * group + 3]
-            _ground(summary, matrix, target.neighbours.diagonal, work.diagonal)
-            factor_lanes(target.panels, target.entries, matrix, work.diagonal, factor)
+            _ground(summary, matrix, target.tensor.diagonal, work.diagonal)
             _project(means, right)
             for row in range(len(x)):
                 store(x, row, load(right, row))
-            solve_lanes(target.panels, factor, x)
+            solve_lanes(target.panels, target.entries, matrix, work.diagonal, factor, x)
             _shift(means, x)
-            _measure(target.neighbours, matrix, right, x, summary)
+            _measure(target.tensor, matrix, right, x, work.rest, summary)
             _report(summary, factor.failed, work.diagonal, first, count, results)
             if gradient.line.size > 0:
                 _multiply(target.tensor, x, matrix)
@@ -451,6 +496,7 @@ def solve_faces(  # type: ignore[no-untyped-def]
         _quadratic_forms(target.tensor, work.matrix, work.forms)
         for k in range(begin, min(begin + GROUPS * LANES, faces.size)):
             group, lane = divmod(k - begin, LANES)
+            weights = work.weights[3 * most * group : 3 * most * (group + 1)]
+            active = slots.active[most * group : most * group + slots.counts[group]]
             x = work.x[group * 2 * n : (group + 1) * 2 * n]
-            _accumulate(source, x, work.forms[group:], lane, faces[k], at, gradient.area[0, k], gradient)
-            at += source.start[faces[k] + 1] - source.start[faces[k]]
+            _accumulate(weights, active, x, work.forms[group:], lane, gradient.area[0, k], gradient)

@@ -102,10 +102,10 @@ def kernel(signature: Any) -> Any:
 
 @kernel(types.void(FLOATS, INTEGERS, *[types.int64] * 8))
 def _update(values, places, begin, lines, columns, stride, depth, place, target, width):  # type: ignore[no-untyped-def]
-    """X[place[i], place[j]] −= Σ_k A[i, k] A[j, k] for all lines i of A and its first lines j."""
+    """X[place[i], place[j]] −= Σ_k A[i, k] A[j, k] for lines i of A and its first lines j ≤ i."""
     for i in range(0, lines, TILE_ROWS):
         rows = min(TILE_ROWS, lines - i)
-        for j in range(0, columns, TILE_COLUMNS):
+        for j in range(0, min(columns, i + rows), TILE_COLUMNS):
             update_tile(
                 values, places, begin + i * stride, begin + j * stride, stride, depth, place + i, place + j,
                 target, width, rows, min(TILE_COLUMNS, columns - j),
@@ -171,45 +171,30 @@ def _factor_columns(factor, diagonal, column, begin, lines, width, count):  # ty
             store(values, line + j, multiply(entry, load(inverse, column + j)))
 
 
-@kernel(types.void(PANELS, ENTRIES, FLOATS, FLOATS, FACTOR))
-def factor_lanes(panels, entries, matrix, diagonal, factor):  # type: ignore[no-untyped-def]
-    """Factor A = L Lᵀ in every lane.
-
-    Parameters
-    ----------
-    panels : Panels
-    entries : Entries
-    matrix : (E, LANES) float64
-        Entries of the lower triangle.
-    diagonal : (n, LANES) float64
-        Diagonal entries, which replace those of `matrix`.
-    factor : Factor
-        Overwritten.
-    """
+@kernel(types.void(PANELS, ENTRIES, FLOATS, FLOATS, FACTOR, types.int64))
+def _factor_panel(panels, entries, matrix, diagonal, factor, panel):  # type: ignore[no-untyped-def]
+    """One panel of L: its entries of A, what earlier panels take from them, then its own columns."""
     values = factor.values
-    store(factor.failed, 0, splat(-1.0))
-    store(factor.failed, 1, splat(0.0))
-    for panel in range(panels.first.size):
-        start, width, column = panels.start[panel], panels.width[panel], panels.first[panel]
-        lines = panels.row_start[panel + 1] - panels.row_start[panel]
-        for cell in range(start, panels.start[panel + 1]):
-            store(values, cell, splat(0.0))
-        for k in range(entries.start[panel], entries.start[panel + 1]):
-            store(values, entries.cell[k], load(matrix, entries.entry[k]))
-        for k in range(width):
-            store(values, start + k * width + k, load(diagonal, column + k))
-        for u in range(panels.update_start[panel], panels.update_start[panel + 1]):
-            other, a, b, place = panels.updates[4 * u : 4 * u + 4]
-            depth = panels.width[other]
-            below = panels.row_start[other + 1] - panels.row_start[other] - a
-            begin = panels.start[other] + a * depth
-            _update(values, panels.places, begin, below, b - a, depth, depth, place, start, width)
-        for k in range(0, width, 4):
-            count = min(4, width - k)
-            begin = start + k * width
-            if k > 0:
-                _update(values, panels.places, begin, lines - k, count, width, k, k, start, width)
-            _factor_columns(factor, diagonal, column + k, begin + k, lines - k, width, count)
+    start, width, column = panels.start[panel], panels.width[panel], panels.first[panel]
+    lines = panels.row_start[panel + 1] - panels.row_start[panel]
+    for cell in range(start, panels.start[panel + 1]):
+        store(values, cell, splat(0.0))
+    for k in range(entries.start[panel], entries.start[panel + 1]):
+        store(values, entries.cell[k], load(matrix, entries.entry[k]))
+    for k in range(width):
+        store(values, start + k * width + k, load(diagonal, column + k))
+    for u in range(panels.update_start[panel], panels.update_start[panel + 1]):
+        other, a, b, place = panels.updates[4 * u : 4 * u + 4]
+        depth = panels.width[other]
+        below = panels.row_start[other + 1] - panels.row_start[other] - a
+        begin = panels.start[other] + a * depth
+        _update(values, panels.places, begin, below, b - a, depth, depth, place, start, width)
+    for k in range(0, width, 4):
+        count = min(4, width - k)
+        begin = start + k * width
+        if k > 0:
+            _update(values, panels.places, begin, lines - k, count, width, k, k, start, width)
+        _factor_columns(factor, diagonal, column + k, begin + k, lines - k, width, count)
 
 
 @kernel(types.void(PANELS, FACTOR, types.int64, FLOATS))
@@ -310,18 +295,27 @@ def _backwards(panels, factor, panel, x):  # type: ignore[no-untyped-def]
             store(x, own + 2 * k + 1, subtract_product(entry, x1, load(x, own + 2 * k + 1)))
 
 
-@kernel(types.void(PANELS, FACTOR, FLOATS))
-def solve_lanes(panels, factor, x):  # type: ignore[no-untyped-def]
-    """Solve L Lᵀ x = b in every lane for two right-hand sides.
+@kernel(types.void(PANELS, ENTRIES, FLOATS, FLOATS, FACTOR, FLOATS))
+def solve_lanes(panels, entries, matrix, diagonal, factor, x):  # type: ignore[no-untyped-def]
+    """Factor A = L Lᵀ and solve A x = b in every lane, for two right-hand sides.
 
     Parameters
     ----------
     panels : Panels
+    entries : Entries
+    matrix : (E, LANES) float64
+        Entries of the lower triangle.
+    diagonal : (n, LANES) float64
+        Diagonal entries, which replace those of `matrix`.
     factor : Factor
-    x : (2n, LANES) float64
+        Overwritten.
+    x : (2n or more, LANES) float64
         Row 2k + s holds entry k of right-hand side s; overwritten by the solution.
     """
+    store(factor.failed, 0, splat(-1.0))
+    store(factor.failed, 1, splat(0.0))
     for panel in range(panels.first.size):
+        _factor_panel(panels, entries, matrix, diagonal, factor, panel)
         _forwards(panels, factor, panel, x)
     for panel in range(panels.first.size - 1, -1, -1):
         _backwards(panels, factor, panel, x)

@@ -135,13 +135,14 @@ def _solved(systems: Systems, faces: IntArray, room: Bench, *, potential: bool, 
 
 def _sums(systems: Systems, faces: IntArray) -> tuple[IntArray, Gradient]:
     """Functions that live on some faces, and zeros to add their rows of the gradient to."""
-    source = systems.source
-    counts = source.start[faces + 1] - source.start[faces]
-    where = np.repeat(source.start[faces] - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
-    functions, line = np.unique(source.function[where], return_inverse=True)
-    areas = systems.softmap.source.mesh.face_areas[faces][None, :].copy()
+    source = systems.softmap.source
+    vertices = np.unique(source.mesh.faces[faces])
+    functions = np.unique(source.functions[vertices].indices).astype(np.int64)
+    line = np.zeros(source.size if faces.size else 0, dtype=np.int64)
+    line[functions] = np.arange(functions.size)
+    areas = source.mesh.face_areas[faces][None, :].copy()
     slopes, forms = np.zeros((2, functions.size, systems.softmap.target.size))
-    return functions, Gradient(line.astype(np.int64), areas, slopes, forms)
+    return functions, Gradient(line, areas, slopes, forms)
 
 
 def _refuse_untrustworthy(systems: Systems, faces: IntArray, results: FloatArray) -> None:

@@ -20,7 +20,7 @@ from solver.mesh import IntArray
 #: arithmetic.
 PADDING = 0.05
 #: Widest panel: what a panel is updated by should stay in the first cache.
-WIDEST = 24
+WIDEST = 32
 
 
 class Panels(NamedTuple):

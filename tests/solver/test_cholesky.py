@@ -7,7 +7,7 @@ import pytest
 from scipy import sparse
 
 from solver.basis import poisson_basis
-from solver.cholesky import Entries, Factor, factor_lanes, solve_lanes
+from solver.cholesky import Entries, Factor, solve_lanes
 from solver.lanes import LANES, empty_lanes
 from solver.symbolic import WIDEST, Symbolic, analyse
 from solver.tensor import face_gradients, target_tensor
@@ -58,8 +58,10 @@ def matrices(pattern: np.ndarray, rng: np.random.Generator, count: int = LANES) 
     return np.asarray(scale[:, :, None] * definite * scale[:, None, :])
 
 
-def factored(symbolic: Symbolic, given: np.ndarray) -> tuple[Factor, np.ndarray]:
-    """Factor a stack of matrices, one in each lane; the reordered stack beside it."""
+def solved(
+    symbolic: Symbolic, given: np.ndarray, right: np.ndarray | None = None
+) -> tuple[Factor, np.ndarray, np.ndarray]:
+    """Factor a stack of matrices, one in each lane; beside it the reordered stack and its solutions."""
     reordered = given[:, symbolic.order][:, :, symbolic.order]
     rows, columns = np.nonzero(np.tril((given[:, symbolic.order][:, :, symbolic.order] != 0).any(axis=0)))
     cells = symbolic.cells(rows, columns)
@@ -71,25 +73,19 @@ def factored(symbolic: Symbolic, given: np.ndarray) -> tuple[Factor, np.ndarray]
     diagonal[:] = np.diagonal(reordered, axis1=1, axis2=2).T
     factor = Factor(empty_lanes(int(symbolic.panels.start[-1])), empty_lanes(n), empty_lanes(2))
     factor.values.fill(np.nan)
-    factor_lanes(symbolic.panels, Entries(start, entry, cells[entry]), matrix, diagonal, factor)
-    return factor, reordered
-
-
-def solved(symbolic: Symbolic, factor: Factor, right: np.ndarray) -> np.ndarray:
-    """Solutions (LANES, n, 2) of the reordered systems."""
-    x = empty_lanes(2 * len(symbolic.order))
+    right = np.ones((LANES, n, 2)) if right is None else right
+    x = empty_lanes(2 * n)
     x[:] = right.reshape(LANES, -1).T
-    solve_lanes(symbolic.panels, factor, x)
-    return x.T.reshape(right.shape)
+    solve_lanes(symbolic.panels, Entries(start, entry, cells[entry]), matrix, diagonal, factor, x)
+    return factor, reordered, x.T.reshape(right.shape)
 
 
 @pytest.mark.parametrize("name", PATTERNS)
 def test_systems_of_any_pattern_are_solved(name: str, rng: np.random.Generator) -> None:
     pattern = PATTERNS[name]
     symbolic = analyse(sparse.csr_array(pattern.astype(float)))
-    factor, given = factored(symbolic, matrices(pattern, rng))
     right = rng.normal(size=(LANES, len(pattern), 2))
-    found = solved(symbolic, factor, right)
+    factor, given, found = solved(symbolic, matrices(pattern, rng), right)
     size = abs(given) @ abs(found) + abs(right)
     assert (abs(given @ found - right) / size).max() < 1e-14
     assert (factor.failed[0] == -1).all()
@@ -99,7 +95,7 @@ def test_systems_of_any_pattern_are_solved(name: str, rng: np.random.Generator) 
 def test_the_panels_hold_the_factor(name: str, rng: np.random.Generator) -> None:
     pattern = PATTERNS[name]
     symbolic = analyse(sparse.csr_array(pattern.astype(float)))
-    factor, given = factored(symbolic, matrices(pattern, rng))
+    factor, given, _ = solved(symbolic, matrices(pattern, rng))
     expected = np.linalg.cholesky(given)
     rows, columns = np.nonzero(np.tril(abs(expected).max(axis=0)))
     found = factor.values[symbolic.cells(rows, columns)].T
@@ -132,11 +128,11 @@ def test_neighbours_change_no_bit(rng: np.random.Generator) -> None:
     pattern = PATTERNS["lattice"]
     symbolic = analyse(sparse.csr_array(pattern.astype(float)))
     given = matrices(pattern, rng)
-    once = factored(symbolic, given)[0].values.copy()
-    rolled = factored(symbolic, np.roll(given, 1, axis=0))[0].values
+    once = solved(symbolic, given)[0].values.copy()
+    rolled = solved(symbolic, np.roll(given, 1, axis=0))[0].values
     np.testing.assert_array_equal(np.roll(once, 1, axis=1), rolled)
     given[1:, pattern] = np.nan
-    alone = factored(symbolic, given)[0].values
+    alone = solved(symbolic, given)[0].values
     np.testing.assert_array_equal(alone[:, 0], once[:, 0])
 
 
@@ -153,7 +149,7 @@ def test_a_pivot_that_is_not_positive_is_told_in_its_lane_alone(
     other = 5
     given[lane, column, other] = given[lane, other, column] = 1.0
     given[lane, column, column] = 1.0 + value
-    factor, _ = factored(symbolic, given)
+    factor, _, _ = solved(symbolic, given)
     last = max(np.flatnonzero(symbolic.order == column)[0], np.flatnonzero(symbolic.order == other)[0])
     assert factor.failed[0, lane] == last or np.isnan(value)
     assert factor.failed[0, lane] >= 0
