@@ -209,21 +209,22 @@ def up(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[bytes], dict[int, str]
     """`softmaps up`, ready, all its processes, and its data folder."""
     folder = tmp_path / "data"
     command = [sys.executable, "-m", "service", "up", "--port", "0", "--data", str(folder), "--json"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True)
-    assert process.stdout is not None
-    document = b""
-    while not document.rstrip().endswith(b"}"):
-        line = process.stdout.readline()
-        assert line, "it ended before it was ready"
-        document += line
-    assert json.loads(document)["pid"] == process.pid
-    until(lambda: len(like(of_folder(folder), "-m worker")) >= 2)
-    yield process, of_folder(folder), folder
-    if process.poll() is None:
-        process.kill()
-        process.wait()
-    process.stdout.close()
-    until(lambda: of_folder(folder) == {})
+    with subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True) as process:
+        try:
+            assert process.stdout is not None
+            document = b""
+            while not document.rstrip().endswith(b"}"):
+                line = process.stdout.readline()
+                assert line, "it ended before it was ready"
+                document += line
+            assert json.loads(document)["url"].startswith("http://127.0.0.1:"), document
+            until(lambda: len(like(of_folder(folder), "-m worker")) >= 2)
+            yield process, of_folder(folder), folder
+        finally:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+            until(lambda: of_folder(folder) == {})
 
 
 def assert_nothing_is_left(processes: dict[int, str], folder: Path) -> None:
