@@ -156,6 +156,7 @@ def softmap_cost(spec: specs.SoftMap, sizes: Sizes) -> Cost:
     if isinstance(spec.map, specs.Descriptors):
         _, columns = sizes.descriptor(spec.map.source)
         seconds += (1e-8 + 2e-10 * columns) * source.mesh.n_vertices * target.mesh.n_vertices
+        # 25 MB of similarities a thread, for sixteen threads.
         memory += _FLOAT * columns * (source.mesh.n_vertices + target.mesh.n_vertices) + 400_000_000
     if isinstance(spec.map, specs.Mixture):
         seconds += 4e-9 * entries * len(spec.map.maps)
@@ -166,16 +167,14 @@ def softmap_cost(spec: specs.SoftMap, sizes: Sizes) -> Cost:
 def solve_seconds(size: MapSize, n_faces: int) -> float:
     """Time of the solve for some source faces: assembly, a factorisation and two substitutions each."""
     n = size.target.n_functions
-    setup = 0.05 + 2e-5 * (size.source.mesh.n_faces + size.target.mesh.n_faces)
-    return setup + n_faces * (1e-5 + 1.9e-6 * n + 4.2e-11 * n**3)
+    setup = 0.02 + 1e-5 * (size.source.mesh.n_faces + size.target.mesh.n_faces) + 6e-4 * n
+    return setup + n_faces * (1.4e-7 * n + 1.2e-9 * n**2)
 
 
 def solve_bytes(size: MapSize, n_faces: int) -> int:
-    """Memory of that solve, but for what it returns: the tensor W, and a batch of systems."""
-    n = size.target.n_functions
-    return (
-        3_000 * (size.source.mesh.n_faces + size.target.mesh.n_faces) + 64 * 3 * _FLOAT * n**2 + 64 * n_faces
-    )
+    """Memory of that solve, but for what it returns: gradients, the tensor W, factors for some threads."""
+    n_source, n_target = size.source.mesh.n_faces, size.target.mesh.n_faces
+    return 3_000 * (n_source + n_target) + 100_000 * size.target.n_functions + 64 * n_faces
 
 
 def energy_block_cost(spec: specs.EnergyBlock, sizes: Sizes) -> Cost:
@@ -194,7 +193,7 @@ def _energy(size: MapSize, n_faces: int, gradient: bool) -> Cost:
     memory = solve_bytes(size, n_faces) + _FLOAT * entries * (5 if gradient else 2)
     seconds = solve_seconds(size, n_faces)
     if gradient:
-        seconds += n_faces * (5e-5 + 2.2e-6 * size.target.n_functions)
+        seconds += n_faces * 1.5e-7 * size.target.n_functions
     return Cost(seconds, memory)
 
 
@@ -213,9 +212,7 @@ def _potential(size: MapSize, n_faces: int) -> Cost:
     row = 2 * size.target.n_functions + 6
     # Solved, then written block by block: 30 ns a number covers hashing and the disk.
     seconds = solve_seconds(size, n_faces) + 3e-8 * row * n_faces
-    # A block's solutions are held with all they were made of.
-    block = min(n_faces, FACE_BLOCK) * 26 * size.target.n_functions
-    return Cost(seconds, solve_bytes(size, n_faces) + _FLOAT * (2 * row * n_faces + block))
+    return Cost(seconds, solve_bytes(size, n_faces) + 2 * _FLOAT * row * n_faces)
 
 
 def gathering_cost(size: MapSize, n_faces: int, gradient: bool) -> Cost:
