@@ -60,7 +60,7 @@ class Target(NamedTuple):
     entries : Entries
     tensor : Tensor
     integrals : ndarray of float64, shape (1, n)
-        ∫βⱼ; here, in Cᵀ and in (CU)ᵀ, n is rounded up to an even number by zeros.
+        ∫βⱼ; here, in C and in CU, n is rounded up to an even number by a column of zeros.
     """
 
     panels: Panels
@@ -83,8 +83,8 @@ class Source(NamedTuple):
     function : ndarray of int64, shape (nnz,)
     value : ndarray of float64, shape (1, nnz)
         β₀ᵢ at the vertex.
-    coefficients, received : ndarray of float64, shape (n, n₀)
-        Cᵀ and (CU)ᵀ.
+    coefficients, received : ndarray of float64, shape (n₀, n)
+        C and CU.
     """
 
     corner: IntArray
@@ -172,8 +172,8 @@ def systems(softmap: SoftMap, regularisation: float) -> Systems:
         start=functions.indptr.astype(np.int64),
         function=functions.indices.astype(np.int64),
         value=np.array(functions.data, dtype=np.float64, ndmin=2),
-        coefficients=_even(softmap.coefficients.T[order]),
-        received=_even((softmap.target.overlap.T @ softmap.coefficients.T)[order]),
+        coefficients=_even(softmap.coefficients[:, order]),
+        received=_even((softmap.coefficients @ softmap.target.overlap)[:, order]),
     )
     widest = int(np.diff(functions.indptr)[mesh.faces].sum(axis=1).max())
     return Systems(softmap, float(regularisation), plan, source, widest)
@@ -208,14 +208,14 @@ def _plan(basis: Basis) -> Plan:
     )
     symbolic = analyse(sparse.csr_array(pattern + pattern.T))
     grouped = _grouped(tensor, symbolic)
-    integrals = _even(basis.integrals[symbolic.order][:, None]).T.copy()
+    integrals = _even(basis.integrals[symbolic.order][None, :])
     entries = _entries(symbolic, grouped.row[: tensor.rows.size], grouped.column[: tensor.rows.size])
     return Plan(symbolic, Target(symbolic.panels, entries, grouped, integrals))
 
 
-def _even(lines: FloatArray) -> FloatArray:
-    """An array with a line of zeros more if their number is odd: kernels take them two by two."""
-    return np.ascontiguousarray(np.pad(lines, [(0, len(lines) % 2), (0, 0)]))
+def _even(columns: FloatArray) -> FloatArray:
+    """An array with a zero column more if their number is odd: kernels take them two by two."""
+    return np.ascontiguousarray(np.pad(columns, [(0, 0), (0, columns.shape[1] % 2)]))
 
 
 def _grouped(tensor: TargetTensor, symbolic: Symbolic) -> Tensor:
