@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("softmaps.worker")
 
-#: Shortest time between two notes of how far a task is, in seconds.
+#: Shortest time between two notes of a fraction, in seconds; a new phase waits only for the last but one.
 NOTE_SECONDS: Final = 0.5
 #: Longest that a note may hold up a task when Redis does not answer, and how long notes then pause.
 _NOTE_TIMEOUT: Final = 0.5
@@ -246,24 +246,31 @@ class Notes:
         self._task = task
         self.started_at = now()
         self._phase = "starting"
-        self._next = 0.0
+        self._noted = (0.0, 0.0)
+        self._paused = 0.0
 
     def step(self, words: str, start: float, stop: float) -> Report:
         """Say what happens from now on, and return how to say how much of that share is done."""
         self._phase = words
-        self._note(start)
-        return lambda done: self._note(start + (stop - start) * done)
+        self._note(start, time.monotonic() - self._noted[0] >= 2 * NOTE_SECONDS)
+        return self._report(start, stop)
 
-    def _note(self, fraction: float) -> None:
+    def _report(self, start: float, stop: float) -> Report:
+        def report(done: float) -> None:
+            self._note(start + (stop - start) * done, time.monotonic() - self._noted[1] >= NOTE_SECONDS)
+
+        return report
+
+    def _note(self, fraction: float, due: bool) -> None:
         moment = time.monotonic()
-        if moment < self._next:
+        if not due or moment < self._paused:
             return
         said = Step(self.started_at, min(1.0, max(0.0, fraction)), self._phase).dump()
         try:
             self._connection.set(self._attempts.key("progress", self._task), said, ex=jobs.STEP_SECONDS)
-            self._next = moment + NOTE_SECONDS
+            self._noted = (self._noted[1], moment)
         except redis.exceptions.RedisError:
-            self._next = moment + _NOTE_PAUSE
+            self._paused = moment + _NOTE_PAUSE
 
 
 def refused(task: str, error: SolverError) -> Problem:

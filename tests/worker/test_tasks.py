@@ -245,10 +245,13 @@ def test_notes_are_few_and_say_what_happens(
     notes = Notes(connection, attempts, job.tasks[0].id)
     sets = "cmdstat_set"
     before = connection.info("commandstats")[sets]["calls"]
+    notes.step("reading", 0.0, 0.0)
     report = notes.step("geodesic samples", 0.0, 0.5)
     for k in range(1000):
         report(k / 1000)
-    assert connection.info("commandstats")[sets]["calls"] == before + 1
+        notes.step("geodesic samples", 0.0, 0.5)
+    assert connection.info("commandstats")[sets]["calls"] == before + 2
+    assert "geodesic samples" in connection.get(attempts.key("progress", job.tasks[0].id)).decode()
     assert connection.ttl(attempts.key("progress", job.tasks[0].id)) > 0
 
 
