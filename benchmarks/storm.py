@@ -103,7 +103,6 @@ def storm(stack: Stack, client: Client, *, flush: bool) -> None:
     whole = sum(bool(client.arrays(id_)) for id_ in ids)
     states = {state: list(ended.values()).count(state) for state in sorted(set(ended.values()))}
     print(f"{len(set(ids))} jobs after {seconds:.1f} s: {states}; {whole} artifacts read back whole")
-    print(f"children replaced: {stack.deaths}")
 
 
 def busy_workers() -> tuple[int, int]:
