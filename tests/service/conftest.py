@@ -151,7 +151,7 @@ def tight(own_redis: EmbeddedRedis, tmp_path_factory: pytest.TempPathFactory) ->
         max_json_bytes=600,
         max_array_bytes=100,
         max_queued=4,
-        max_cost_seconds=0.6,
+        max_cost_seconds=0.25,
     )
     with serving(settings) as running:
         yield running
