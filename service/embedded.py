@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
-import os
 import shutil
 import signal
 import subprocess
@@ -16,7 +14,7 @@ from typing import IO, Self
 
 import redis
 
-from service.supervisor import leashed
+from service.supervisor import end_by, leashed
 
 #: Longest a healthy server needs to replay its log and answer; it takes 34 ms on an empty one.
 START_SECONDS = 60.0
@@ -123,11 +121,7 @@ class EmbeddedRedis:
         """Stop the server and remove its socket; stopping twice is harmless."""
         if self.alive:
             self.process.send_signal(signal.SIGTERM)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self.process.wait(STOP_SECONDS)
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait()
+        end_by(self.process, time.monotonic() + STOP_SECONDS)
         shutil.rmtree(self._run, ignore_errors=True)
         self._log.close()
         self._lock.close()

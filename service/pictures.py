@@ -241,12 +241,13 @@ def render(
     normals = np.einsum("pk,pkx->px", weight, _vertex_normals(seen, faces)[corners])
     # Both sides are lit, since a mesh may be open or inside out; the face decides which side it is, for the
     # interpolated normal may point away at a silhouette.
-    across = seen[corners]
-    outward = np.cross(across[:, 1] - across[:, 0], across[:, 2] - across[:, 0])[:, 2:]
-    normals *= np.where(outward < 0.0, -1.0, 1.0)
+    a, b, c = (seen[faces[:, k]] for k in range(3))
+    away = np.cross(b - a, c - a)[:, 2] < 0.0
+    normals[away[face]] *= -1.0
     flat = len(colours) == len(faces)
     colour = colours[face] if flat else np.einsum("pk,pkx->px", weight, colours[corners])
-    picture = np.zeros((height * width, 4))
+    # Eight bits a channel come out: single precision is plenty.
+    picture = np.zeros((height * width, 4), dtype=np.float32)
     picture[covered, :3] = np.clip(colour * _light(normals)[:, None], 0.0, 1.0)
     picture[covered, 3] = 1.0
     picture = picture.reshape(size[1], OVERSAMPLING, size[0], OVERSAMPLING, 4).mean(axis=(1, 3))

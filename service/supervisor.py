@@ -46,6 +46,24 @@ def module(name: str, *options: str) -> list[str]:
     return [sys.executable, "-P", "-m", name, *options]
 
 
+def end_by(process: subprocess.Popen[bytes], deadline: float) -> None:
+    """Wait for the end of a process that leads its group until a moment, then kill all of its group.
+
+    Parameters
+    ----------
+    process : Popen
+        Has been told to end.
+    deadline : float
+        Of the monotonic clock.
+    """
+    try:
+        process.wait(max(0.0, deadline - time.monotonic()))
+    except subprocess.TimeoutExpired:
+        # Only now: the number of a process that was waited for may be somebody else's.
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
 @dataclass(frozen=True)
 class Plan:
     """What a child is.
@@ -113,7 +131,6 @@ class Child:
         if self.alive:
             return
         if not self._due:
-            self._end_session()
             self.deaths += 1
             self._pause = (
                 FIRST_PAUSE if now - self._since > LONG_LIFE else min(2 * self._pause, LONGEST_PAUSE)
@@ -130,15 +147,7 @@ class Child:
 
     def end(self, deadline: float) -> None:
         """Wait for its end until a moment, then kill what is left of it."""
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(max(0.0, deadline - time.monotonic()))
-        self._end_session()
-        self.process.wait()
-
-    def _end_session(self) -> None:
-        # It leads its session, and what it leaves in its group goes with it.
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(self.process.pid, signal.SIGKILL)
+        end_by(self.process, deadline)
 
     def last_words(self) -> str:
         """End of its log, for a message."""
