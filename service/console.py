@@ -245,8 +245,11 @@ def interrupt_on_termination() -> None:
     def interrupt(number: int, frame: FrameType | None) -> None:
         # Whoever presses it again must not interrupt the cleaning up, which ends soon enough.
         for each in numbers:
-            signal.signal(each, signal.SIG_IGN)
+            signal.signal(each, ignore)
         raise KeyboardInterrupt
+
+    def ignore(number: int, frame: FrameType | None) -> None:
+        """Do nothing; SIG_IGN would have Python complain about a second signal at the same moment."""
 
     for number in numbers:
         signal.signal(number, interrupt)

@@ -12,6 +12,7 @@ import typer
 from service.console import Screen, errors_in_words, interrupt_on_termination, settings_in_words, table
 from service.locating import service_of, stopping
 from service.options import Data, Json, Url
+from service.stack import LOOK_SECONDS, Stack
 from service.supervisor import module
 
 
@@ -25,8 +26,6 @@ def up(
     json: Json = False,
 ) -> None:
     """Run everything on this machine: Redis, the API and workers. Ctrl-C stops it all."""
-    from service.stack import Stack  # noqa: PLC0415
-
     screen = Screen(json)
     settings = settings_in_words(screen, data=data)
     interrupt_on_termination()
@@ -45,7 +44,7 @@ def up(
                 if not settings.token and host not in {"127.0.0.1", "localhost", "::1"}:
                     screen.say("anybody who reaches this address may use it: SOFTMAPS_TOKEN is not set")
                 while True:
-                    stack.watch(3600.0)
+                    stack.watch(LOOK_SECONDS)
             except KeyboardInterrupt:
                 screen.say("stopping")
 

@@ -111,7 +111,7 @@ class Stack:
             If a part does not come up; everything is stopped again.
         """
         self._thread.start()
-        self._settled.wait()
+        _until(self._settled)
         if self._failure:
             self.stop()
             raise StackError(self._failure)
@@ -121,12 +121,17 @@ class Stack:
         self._ending.set()
         if self._thread.ident is not None:
             # Not join(): interrupted by Ctrl-C, Python 3.11 takes the thread for ended.
-            self._ended.wait()
+            _until(self._ended)
         self._listener.close()
         self._lock.close()
 
     def watch(self, seconds: float) -> None:
         """Wait so long, or until the stack ends by itself.
+
+        Parameters
+        ----------
+        seconds : float
+            Short for whoever expects signals, see `_until`.
 
         Raises
         ------
@@ -276,6 +281,13 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def _until(event: threading.Event) -> None:
+    """Wait for an event without missing a signal."""
+    # Two signals at once may both be taken by another thread, which does not wake this one to handle them.
+    while not event.wait(LOOK_SECONDS):
+        pass
 
 
 def _check_redis(url: str) -> None:
