@@ -165,7 +165,9 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> 
         show_header=any(columns),
     )
     for number, column in enumerate(columns):
-        drawn.add_column(column, justify="left" if number == 0 else "right", no_wrap=number > 0)
+        # Names and ids are there to be copied: what is short of room are the numbers.
+        widest = max((len(row[0]) for row in rows), default=0) if number == 0 else None
+        drawn.add_column(column, justify="right" if number else "left", no_wrap=number > 0, min_width=widest)
     for row in rows:
         drawn.add_row(*map(escape, row))
     return drawn

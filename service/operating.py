@@ -9,6 +9,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from service.answers import Job
 from service.console import Screen, errors_in_words, interrupt_on_termination, settings_in_words, table
 from service.locating import service_of, stopping
 from service.options import Data, Json, Url
@@ -98,21 +99,19 @@ def jobs(
             found = [client.dismiss(id) if dismiss else client.job(id)]
     screen.answer({"jobs": [job.document for job in found]})
     rows = [
-        (
-            job.id,
-            job.status,
-            f"{job.progress:.0f} %",
-            (job.created_at or "")[:19].replace("T", " "),
-            _took(job.seconds),
-        )
+        (job.id, _state(job), _took(job.seconds), (job.created_at or "")[5:16].replace("T", " "))
         for job in found
     ]
-    screen.show(table("", ("job", "status", "done", "asked (UTC)", "seconds"), rows) if rows else "no jobs")
+    screen.show(table("", ("job", "status", "seconds", "asked (UTC)"), rows) if rows else "no jobs")
     if id is not None:
         for job in found:
             screen.show(table("", ("task", "status"), [(task.id, task.status) for task in job.tasks]))
             if job.error is not None:
                 screen.show(str(job.error.get("detail")))
+
+
+def _state(job: Job) -> str:
+    return f"{job.status} {job.progress:.0f} %" if job.status == "running" else job.status
 
 
 def _took(seconds: float | None) -> str:
