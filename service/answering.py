@@ -32,6 +32,7 @@ from service.options import (
     Method,
     Out,
     Regularisation,
+    Sharpness,
     Sigma,
     Size,
     Source,
@@ -45,8 +46,9 @@ def energy(
     target: Target,
     map: MapOption = "wks",
     size: Size = None,
-    method: Method = "poisson",
+    method: Method = None,
     cutoff: Cutoff = None,
+    sharpness: Sharpness = None,
     sigma: Sigma = None,
     regularisation: Regularisation = 1e-5,
     gradient: Annotated[bool, typer.Option("--gradient", help="Gradients too (written by --out).")] = False,
@@ -62,7 +64,8 @@ def energy(
     if up_axis not in {"x", "y", "z"}:
         raise typer.BadParameter("is x, y or z", param_hint="--up")
     screen = Screen(json)
-    pair = Pair(source, target, map, size, method, cutoff, sigma)
+    bases = BasisOptions(method=method, cutoff=cutoff, sharpness=sharpness)
+    pair = Pair(source, target, map, size, bases, sigma)
     with _service(screen, url, data, pair) as client:
         asked, names = pair.softmap(client)
         spec = {"kind": "energy", "softmap": asked, "regularisation": regularisation, "gradient": gradient}
@@ -114,8 +117,9 @@ def energy(
 def basis(
     mesh: Annotated[str, typer.Argument(callback=mesh_argument, help="Mesh: a file or an id.")],
     size: Annotated[int, typer.Option(min=1, help="Functions.")] = 300,
-    method: Method = "poisson",
+    method: Method = None,
     cutoff: Cutoff = None,
+    sharpness: Sharpness = None,
     url: Url = None,
     data: Data = None,
     out: Out = None,
@@ -125,7 +129,7 @@ def basis(
     screen = Screen(json)
     with _service(screen, url, data) as client:
         uploaded = client.mesh(mesh)
-        spec = BasisOptions(size, method, cutoff).spec(uploaded.id)
+        spec = BasisOptions(size, method, cutoff, sharpness).spec(uploaded.id)
         answer = answered(client, screen, spec, "basis")
         _finish(client, screen, answer, out)
 
@@ -135,8 +139,9 @@ def softmap(
     target: Target,
     map: MapOption = "wks",
     size: Size = None,
-    method: Method = "poisson",
+    method: Method = None,
     cutoff: Cutoff = None,
+    sharpness: Sharpness = None,
     sigma: Sigma = None,
     url: Url = None,
     data: Data = None,
@@ -145,7 +150,8 @@ def softmap(
 ) -> None:
     """Soft map from SOURCE to TARGET; --out writes its coefficients (n₀×n)."""
     screen = Screen(json)
-    pair = Pair(source, target, map, size, method, cutoff, sigma)
+    bases = BasisOptions(method=method, cutoff=cutoff, sharpness=sharpness)
+    pair = Pair(source, target, map, size, bases, sigma)
     with _service(screen, url, data, pair) as client:
         asked, _ = pair.softmap(client)
         _finish(client, screen, answered(client, screen, asked, "map"), out)
@@ -156,8 +162,9 @@ def potential(
     target: Target,
     map: MapOption = "wks",
     size: Size = None,
-    method: Method = "poisson",
+    method: Method = None,
     cutoff: Cutoff = None,
+    sharpness: Sharpness = None,
     sigma: Sigma = None,
     regularisation: Regularisation = 1e-5,
     url: Url = None,
@@ -167,7 +174,8 @@ def potential(
 ) -> None:
     """Transportation potentials of all source faces; --out writes them (F₀×2×n) with their frames."""
     screen = Screen(json)
-    pair = Pair(source, target, map, size, method, cutoff, sigma)
+    bases = BasisOptions(method=method, cutoff=cutoff, sharpness=sharpness)
+    pair = Pair(source, target, map, size, bases, sigma)
     with _service(screen, url, data, pair) as client:
         asked, _ = pair.softmap(client)
         spec = {"kind": "potential", "softmap": asked, "regularisation": regularisation}

@@ -24,25 +24,24 @@ class BasisOptions:
     ----------
     size : int
         Functions of each basis.
-    method : str
-        ``poisson``, or what else the service offers.
+    method : {"poisson", "maxent"}, optional
+        The paper's, or local maximum entropy.
     cutoff : float, optional
         Of the poisson basis, in (0, 1).
+    sharpness : float, optional
+        Of the maxent basis, from 0.5 to 50.
     """
 
     size: int = 300
-    method: str = "poisson"
+    method: str | None = None
     cutoff: float | None = None
+    sharpness: float | None = None
 
     def spec(self, mesh: str, size: int | None = None) -> dict[str, Any]:
         """Spec of a basis on a mesh."""
-        fields: dict[str, Any] = {
-            "kind": "basis",
-            "mesh": mesh,
-            "size": size or self.size,
-            "method": self.method,
-        }
-        return fields if self.cutoff is None else {**fields, "cutoff": self.cutoff}
+        fields: dict[str, Any] = {"kind": "basis", "mesh": mesh, "size": size or self.size}
+        chosen = {"method": self.method, "cutoff": self.cutoff, "sharpness": self.sharpness}
+        return fields | {name: value for name, value in chosen.items() if value is not None}
 
 
 def named_map(name: str, sigma: float | None = None) -> dict[str, Any]:

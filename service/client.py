@@ -41,7 +41,9 @@ class Client(Session):
         map: str | ArrayLike = "wks",
         *,
         size: int = 300,
+        method: str | None = None,
         cutoff: float | None = None,
+        sharpness: float | None = None,
         sigma: float | None = None,
         regularisation: float = 1e-5,
         gradient: bool = False,
@@ -58,8 +60,12 @@ class Client(Session):
             Descriptors to compare, or V₀ integers (targets, from 0 on), or an n₀×n matrix of coefficients.
         size : int
             Functions of each basis.
-        cutoff, sigma : float, optional
-            Of the basis and of the descriptors; the service's defaults unless given.
+        method : {"poisson", "maxent"}, optional
+            How bases are made; as the service does unless given.
+        cutoff, sharpness : float, optional
+            Of poisson and of maxent bases.
+        sigma : float, optional
+            Of the descriptors.
         regularisation : float
             ε.
         gradient : bool
@@ -82,7 +88,7 @@ class Client(Session):
             If the map fits neither the vertices nor a matrix.
         """
         m0, m = self.mesh(source), self.mesh(target)
-        options = BasisOptions(size=size, cutoff=cutoff)
+        options = BasisOptions(size, method, cutoff, sharpness)
         spec = {
             "kind": "energy",
             "softmap": softmap(options.spec(m0.id), options.spec(m.id), self.map_spec(map, m0, m, sigma)),

@@ -60,18 +60,17 @@ class Pair:
         A name, or a file.
     size : int or None
         Functions of each basis; None: as a matrix of coefficients says, else 300.
-    method : str
-        Of the bases.
-    cutoff, sigma : float or None
-        Of the bases and of descriptors; None: the service's defaults.
+    bases : BasisOptions
+        How bases are made; its size is not used.
+    sigma : float or None
+        Of descriptors; None: the service's default.
     """
 
     source: str
     target: str
     map: str
     size: int | None
-    method: str
-    cutoff: float | None
+    bases: BasisOptions
     sigma: float | None
 
     def numbers(self) -> str | NDArray[Any]:
@@ -110,10 +109,9 @@ class Pair:
         rows = columns = self.size or USUAL_SIZE
         if spec["type"] == "matrix" and self.size is None and not isinstance(numbers, str):
             rows, columns = numbers.shape
-        options = BasisOptions(method=self.method, cutoff=self.cutoff)
         names = {source.id: Path(self.source).name}
         names.setdefault(target.id, Path(self.target).name)
-        return softmap(options.spec(source.id, rows), options.spec(target.id, columns), spec), names
+        return softmap(self.bases.spec(source.id, rows), self.bases.spec(target.id, columns), spec), names
 
 
 def answered(client: Client, screen: Screen, spec: Mapping[str, Any], title: str) -> Artifact:

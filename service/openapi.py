@@ -30,8 +30,12 @@ JOB_EXAMPLES: dict[str, dict[str, Any]] = {
         },
     },
     "basis": {
-        "summary": "A basis of 300 functions",
+        "summary": "A basis of 300 functions, as the paper makes it",
         "value": {"kind": "basis", "mesh": _MESH, "size": 300, "method": "poisson", "cutoff": 0.1},
+    },
+    "maxent basis": {
+        "summary": "A basis of 300 functions that reproduces linear functions, so that densities converge",
+        "value": {"kind": "basis", "mesh": _MESH, "size": 300, "method": "maxent", "sharpness": 3.0},
     },
     "descriptor": {
         "summary": "Wave kernel signature at every vertex",
@@ -135,8 +139,10 @@ def completed(document: dict[str, Any]) -> dict[str, Any]:
     schemas["Problem"] = Problem.model_json_schema(ref_template=reference)
     schemas |= schemas["Problem"].pop("$defs", {})
     kinds = []
-    for kind in specs.PUBLIC_KINDS:
-        schema = specs.KINDS[kind].model_json_schema(ref_template=reference)
+    for model in specs.MODELS:
+        if model.private:
+            continue
+        schema = model.model_json_schema(ref_template=reference)
         schemas |= schema.pop("$defs", {})
         schemas[schema["title"]] = schema
         kinds.append({"$ref": reference.format(model=schema["title"])})

@@ -21,8 +21,11 @@ MapOption = Annotated[
     ),
 ]
 Size = Annotated[int | None, typer.Option(min=1, help="Functions of each basis; 300, or as a matrix says.")]
-Method = Annotated[str, typer.Option(help="How bases are made.")]
+Method = Annotated[
+    str | None, typer.Option(help="How bases are made: poisson or maxent. [dim]The service's default.[/]")
+]
 Cutoff = Annotated[float | None, typer.Option(help="Cutoff of the poisson basis, in (0, 1).")]
+Sharpness = Annotated[float | None, typer.Option(help="Sharpness of the maxent basis, from 0.5 to 50.")]
 Sigma = Annotated[float | None, typer.Option(help="Reach of descriptors, in units of their rms distance.")]
 Regularisation = Annotated[float, typer.Option(help="ε, the uniform part of every mass distribution.")]
 Url = Annotated[

@@ -47,9 +47,12 @@ from solver.errors import (
     SingularSystem,
     SolverError,
 )
+from solver.flow import momentum, velocity
+from solver.maxent import maxent_basis
 from solver.mesh import Mesh
 from solver.potential import FACE_BLOCK, Potential, potential, potential_block
 from solver.softmap import SoftMap
+from solver.trace import Path, trace
 
 __all__ = [
     "FACE_BLOCK",
@@ -61,6 +64,7 @@ __all__ = [
     "InvalidMesh",
     "InvalidSoftMap",
     "Mesh",
+    "Path",
     "Potential",
     "SingularSystem",
     "SoftMap",
@@ -72,10 +76,14 @@ __all__ = [
     "gather_dirichlet",
     "hks",
     "hks_of",
+    "maxent_basis",
+    "momentum",
     "poisson_basis",
     "potential",
     "potential_block",
     "spectrum",
+    "trace",
+    "velocity",
     "wks",
     "wks_of",
 ]

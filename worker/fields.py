@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, TypeVar
 
-from pydantic import AfterValidator, BaseModel, Field, GetCoreSchemaHandler, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 #: Most errors that one answer lists.
@@ -20,6 +20,12 @@ MAX_KEY: Final = 64
 Model = TypeVar("Model", bound=BaseModel)
 
 _ID = re.compile(r"(?P<kind>[a-z]+(?:_[a-z]+)*)-[0-9a-f]{32}")
+
+
+class Closed(BaseModel):
+    """Strict, frozen and closed: `true` is no integer, an unknown field is an error, NaN is refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
 class SpecError(Exception):
@@ -99,6 +105,7 @@ Count = Annotated[int, Field(ge=1, le=MAX_INTEGER)]
 Index = Annotated[int, Field(ge=0, le=MAX_INTEGER)]
 Eigenpairs = Annotated[int, Field(ge=2, le=MAX_INTEGER)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
+Sharpness = Annotated[float, Field(ge=0.5, le=50)]
 Positive = Annotated[float, Field(gt=0)]
 #: Adding zero turns -0.0, which asks the same question, into 0.0.
 Weight = Annotated[float, Field(ge=0), AfterValidator(lambda weight: weight + 0.0)]

@@ -140,6 +140,9 @@ class _Reader:
             model = self._chosen(value, "kind", {kind: specs.KINDS[kind] for kind in kinds}, pointer)
             fields: dict[str, Any] = dict(value)  # type: ignore[call-overload]
             noted = len(self.errors)
+            if model is specs.Basis:
+                fields.setdefault("method", next(iter(specs.BASES)))
+                model = self._chosen(fields, "method", specs.BASES, pointer)
             if model is specs.SoftMap and "map" in fields:
                 inner = fields["map"] = self._map(fields["map"], f"{pointer}/map", depth)
                 model = specs.NamedSoftMap if isinstance(inner, specs.NamedDescriptors) else specs.SoftMap
@@ -177,7 +180,7 @@ class _Reader:
         """Make a model of fields, inline parents and lists replaced by their ids."""
         for key in fields:
             if key not in model.model_fields:
-                self._note(pointer + escaped(key), "There is no such field")
+                self._note(pointer + escaped(key), _stray(model, key))
         known = {key: value for key, value in fields.items() if key in model.model_fields}
         for key, value in known.items():
             mark, many = specs.parent_mark(model, key)
@@ -217,6 +220,15 @@ class _Reader:
     def _refuse(self, pointer: str, detail: str) -> NoReturn:
         self._note(pointer, detail)
         raise _Refused
+
+
+def _stray(model: type[BaseModel], key: str) -> str:
+    """What is wrong with a field that a model does not have."""
+    if issubclass(model, specs.Basis):
+        for method, other in specs.BASES.items():
+            if key in other.model_fields:
+                return f"This field belongs to the method {method!r}"
+    return "There is no such field"
 
 
 def flatten(tree: SpecTree, lookup: Lookup) -> Graph:

@@ -38,10 +38,11 @@ class MeshSize:
 
 @dataclass(frozen=True)
 class BasisSize:
-    """A mesh's counts and the number of functions on it."""
+    """A mesh's counts, the number of functions on it, and their overlap beside that of a poisson basis."""
 
     mesh: MeshSize
     n_functions: int
+    overlap: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,9 @@ class Sizes:
         spec = self.spec_of(id_)
         if not isinstance(spec, specs.Basis):
             raise LookupError(id_)
-        return BasisSize(self.mesh(spec.mesh), spec.size)
+        # Of γ alone, measured: how far functions reach, and so what factoring takes.
+        overlap = max(0.5, (2 / spec.sharpness) ** 0.75) if isinstance(spec, specs.MaxentBasis) else 1.0
+        return BasisSize(self.mesh(spec.mesh), spec.size, overlap)
 
     def descriptor(self, id_: str) -> tuple[int, int]:
         """Rows and columns of a descriptor or of an array in its place."""
@@ -120,11 +123,15 @@ class Sizes:
 
 
 def basis_cost(spec: specs.Basis, sizes: Sizes) -> Cost:
-    """Samples by fast marching, then a sparse solve a function on its share of the mesh."""
+    """Samples by fast marching, then a sparse solve a function on its share of the mesh, or logarithms."""
     n_vertices = sizes.mesh(spec.mesh).n_vertices
-    solves = 1.9e-6 * n_vertices**1.5 / spec.size**0.5
-    seconds = 0.03 + 1.5e-5 * n_vertices + 4e-4 * spec.size + solves
-    return Cost(seconds, 3_000 * n_vertices + 20_000 * spec.size)
+    seconds = 0.03 + 1.5e-5 * n_vertices + 4e-4 * spec.size
+    memory = 3_000 * n_vertices + 20_000 * spec.size
+    if isinstance(spec, specs.MaxentBasis):
+        # Discs around samples have 2.4 h for radius, or more where functions are blunt.
+        discs = max(1.0, 3 / spec.sharpness)
+        return Cost(seconds + 4e-5 * n_vertices * discs, memory + round(2_500 * n_vertices * discs))
+    return Cost(seconds + 1.9e-6 * n_vertices**1.5 / spec.size**0.5, memory)
 
 
 def spectrum_cost(spec: specs.Spectrum, sizes: Sizes) -> Cost:
@@ -168,7 +175,7 @@ def solve_seconds(size: MapSize, n_faces: int) -> float:
     """Time of the solve for some source faces: assembly, a factorisation and two substitutions each."""
     n = size.target.n_functions
     setup = 0.02 + 1e-5 * (size.source.mesh.n_faces + size.target.mesh.n_faces) + 6e-4 * n
-    return setup + n_faces * (1.4e-7 * n + 1.2e-9 * n**2)
+    return setup + n_faces * (1.4e-7 * n + 1.2e-9 * size.target.overlap * n**2)
 
 
 def solve_bytes(size: MapSize, n_faces: int) -> int:

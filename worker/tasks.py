@@ -20,13 +20,14 @@ from rq.timeouts import JobTimeoutException
 
 from worker import jobs, library, specs
 from worker.attempts import Attempts
+from worker.bench import Bench, Made, Report
 from worker.fields import kind_of
 from worker.jobs import Step
 from worker.library import Library, Problem
 from worker.plan import MAX_DEATHS, died
 from worker.readers import Reader
 from worker.settings import Settings
-from worker.stages import Bench, Made, Report, stage
+from worker.stages import stage
 from worker.store import JobRecord, Store, StoreError, now
 
 if TYPE_CHECKING:

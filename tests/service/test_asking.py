@@ -79,13 +79,10 @@ def test_files_that_are_no_map(tmp_path: Path) -> None:
 
 
 def test_specs_leave_defaults_to_the_service() -> None:
-    assert BasisOptions(20).spec("mesh-0") == {
-        "kind": "basis",
-        "mesh": "mesh-0",
-        "size": 20,
-        "method": "poisson",
-    }
+    assert BasisOptions(20).spec("mesh-0") == {"kind": "basis", "mesh": "mesh-0", "size": 20}
     assert BasisOptions(cutoff=0.2).spec("mesh-0", 7)["cutoff"] == 0.2
+    maxent = {"kind": "basis", "mesh": "mesh-0", "size": 300, "method": "maxent", "sharpness": 2.0}
+    assert BasisOptions(method="maxent", sharpness=2.0).spec("mesh-0") == maxent
     assert BasisOptions().spec("mesh-0", 7)["size"] == 7
     assert named_map("wks") == {"type": "descriptors", "descriptor": "wks"}
     assert named_map("hks", 0.3)["sigma"] == 0.3

@@ -113,11 +113,15 @@ def test_energy_for_machines(stack: Stack, sphere: Path, tmp_path: Path) -> None
 
 
 def test_energy_for_people(stack: Stack, sphere: Path) -> None:
-    done = softmaps("energy", sphere, sphere, "--size", 10, "--map", "uniform", SOFTMAPS_URL=stack.url)
+    options = ("--size", 10, "--map", "uniform", "--method", "maxent", "--sharpness", 2)
+    done = softmaps("energy", sphere, sphere, *options, SOFTMAPS_URL=stack.url)
     assert done.returncode == DONE, done.stderr
     assert "Dirichlet energy" in done.stdout
     assert "bijectivity energy E_b 1" in " ".join(done.stdout.split())
     assert "all jobs" in done.stdout
+    refused = softmaps("basis", sphere, "--method", "poisson", "--sharpness", 2, "--url", stack.url)
+    assert refused.returncode == FAILED
+    assert "/sharpness: This field belongs to the method 'maxent'" in spoken(refused)
 
 
 def test_the_running_stack_is_found(stack: Stack, sphere: Path) -> None:

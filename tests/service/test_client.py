@@ -118,6 +118,11 @@ def test_energies_of_the_three_kinds_of_map(client: Client, sphere: Mesh) -> Non
     coefficients = client.array(softmap.id, "coefficients")
     again = client.energy(sphere, sphere, coefficients, size=12, timeout=120)
     assert again.dirichlet == pytest.approx(identity.dirichlet, rel=1e-12)
+    smooth = client.energy(
+        sphere, sphere, np.arange(len(sphere[0])), size=12, method="maxent", sharpness=2.0, timeout=120
+    )
+    assert client.lineage(smooth.id)[1].spec["sharpness"] == 2.0  # the basis behind it
+    assert 0 < smooth.dirichlet < 2
     assert client.energy(sphere, sphere, "uniform", size=12, timeout=120).dirichlet == pytest.approx(
         0, abs=1e-12
     )

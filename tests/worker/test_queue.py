@@ -304,7 +304,7 @@ def test_reconciling_runs_what_only_the_store_remembers(
     dispatcher: Dispatcher, store: Store, connection: redis.Redis, mesh: str
 ) -> None:
     """An API that dies between recording and planning leaves records alone."""
-    spec = specs.Basis(mesh=mesh, size=20)
+    spec = specs.PoissonBasis(mesh=mesh, size=20)
     store.write_job(JobRecord(specs.spec_id(spec), specs.dump(spec), asked=True, created_at=now()))
     for _ in range(2):
         dispatcher.reconcile()
@@ -313,7 +313,7 @@ def test_reconciling_runs_what_only_the_store_remembers(
 
 def test_a_question_of_another_version_fails_clearly(dispatcher: Dispatcher, store: Store, mesh: str) -> None:
     old = f"basis-{0:032x}"
-    store.write_job(JobRecord(old, specs.dump(specs.Basis(mesh=mesh)), asked=True, created_at=now()))
+    store.write_job(JobRecord(old, specs.dump(specs.PoissonBasis(mesh=mesh)), asked=True, created_at=now()))
     dispatcher.reconcile()
     job = dispatcher.job(old)
     assert job is not None

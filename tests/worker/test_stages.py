@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import tracemalloc
@@ -15,9 +16,11 @@ from solver import Mesh
 from tests.solver.shapes import icosphere
 from tests.worker.conftest import ask, energy, put_mesh, run
 from worker import sizes, specs
-from worker.fields import SpecError
+from worker.fields import SpecError, kind_of
 from worker.library import Library
+from worker.questions import parse
 from worker.queue import Dispatcher
+from worker.readers import read_basis
 from worker.sizes import Sizes
 from worker.stages import STAGES, stage
 from worker.store import Store
@@ -37,7 +40,7 @@ def two_spheres() -> Mesh:
 
 
 def test_every_kind_has_a_stage() -> None:
-    assert set(STAGES) == set(specs.KINDS.values())
+    assert set(STAGES) == set(specs.MODELS)
 
 
 def test_shards_are_the_blocks_that_the_solver_sums_by() -> None:
@@ -84,6 +87,34 @@ def test_a_target_must_be_connected_and_a_source_need_not_be(dispatcher: Dispatc
     ((place, detail),) = refusal.value.errors
     assert place == "/target"
     assert "2 components" in detail
+
+
+def test_either_method_makes_the_solvers_basis(
+    dispatcher: Dispatcher, store: Store, place: Workplace
+) -> None:
+    mesh, sphere = put_mesh(store, icosphere(1)), icosphere(1)
+    for fields, expected in (
+        ({"method": "maxent", "sharpness": 2.0}, solver.maxent_basis(sphere, 12, 2.0, [3, 4])),
+        ({"method": "poisson", "cutoff": 0.3}, solver.poisson_basis(sphere, 12, 0.3, [3, 4])),
+    ):
+        job = ask(dispatcher, kind="basis", mesh=mesh, size=12, first=[3, 4], **fields)
+        run(place, job)
+        found = read_basis(store, job.id)
+        np.testing.assert_array_equal(found.functions.toarray(), expected.functions.toarray())
+        np.testing.assert_array_equal(found.samples, expected.samples)
+
+
+@pytest.mark.parametrize(
+    ("fields", "place", "owner"),
+    [
+        ({"method": "maxent", "cutoff": 0.1}, "/cutoff", "poisson"),
+        ({"method": "poisson", "sharpness": 3.0}, "/sharpness", "maxent"),
+    ],
+)
+def test_the_other_methods_field_is_refused(fields: dict[str, Any], place: str, owner: str) -> None:
+    with pytest.raises(SpecError) as refusal:
+        parse(json.dumps({"kind": "basis", "mesh": f"mesh-{0:032x}", **fields}))
+    assert refusal.value.errors == ((place, f"This field belongs to the method '{owner}'"),)
 
 
 MAPS: list[tuple[str, dict[str, Any]]] = [
@@ -144,7 +175,7 @@ def test_more_faces_cost_more(store: Store) -> None:
     known = Library(store)
     costs = []
     for mesh in (icosphere(2), icosphere(3)):
-        basis = specs.Basis(mesh=put_mesh(store, mesh), size=30)
+        basis = specs.PoissonBasis(mesh=put_mesh(store, mesh), size=30)
         softmap = specs.SoftMap(source=specs.spec_id(basis), target=specs.spec_id(basis), map=specs.Uniform())
         for spec in (basis, softmap):
             known.know(specs.spec_id(spec), spec)
@@ -162,9 +193,13 @@ def test_estimates_of_memory_are_bounds(dispatcher: Dispatcher, store: Store, pl
     )
     softmap = next(task.id for task in by_descriptors.tasks if task.kind == "softmap")
     potential = ask(dispatcher, kind="potential", softmap=softmap)
+    maxent = [
+        ask(dispatcher, kind="basis", mesh=mesh, size=60, method="maxent", sharpness=sharpness)
+        for sharpness in (1.0, 3.0)
+    ]
     place.prepare()
     seen = set()
-    for job in (by_descriptors, potential):
+    for job in (by_descriptors, potential, *maxent):
         record = store.job(job.id)
         assert record is not None
         for task in record.tasks:
@@ -172,8 +207,8 @@ def test_estimates_of_memory_are_bounds(dispatcher: Dispatcher, store: Store, pl
             place.run(task.id)
             peak = tracemalloc.get_traced_memory()[1]
             tracemalloc.stop()
-            if task.kind not in seen:
-                seen.add(task.kind)
+            if task.id not in seen:
+                seen.add(task.id)
                 assert store.has(task.id)
                 assert peak <= task.bytes, task.kind
-    assert seen == set(specs.PUBLIC_KINDS)
+    assert {kind_of(task) for task in seen} == set(specs.PUBLIC_KINDS)

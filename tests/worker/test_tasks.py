@@ -193,7 +193,7 @@ def test_a_failed_shard_fails_the_whole_for_its_own_reason(
     dispatcher, place = Dispatcher(eager, store, connection), Workplace(eager)
     sphere = icosphere(4)
     mesh = put_mesh(store, sphere)
-    basis = specs.Basis(mesh=mesh, size=2)
+    basis = specs.PoissonBasis(mesh=mesh, size=2)
     halves = np.full((2562, 2), 0.5)
     put_basis(store, basis, halves)
     job = ask(dispatcher, **energy(mesh, 2))
