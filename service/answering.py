@@ -66,7 +66,7 @@ def energy(
     screen = Screen(json)
     bases = BasisOptions(method=method, cutoff=cutoff, sharpness=sharpness)
     pair = Pair(source, target, map, size, bases, sigma)
-    with _service(screen, url, data, pair) as client:
+    with asking(screen, url, data, pair) as client:
         asked, names = pair.softmap(client)
         spec = {"kind": "energy", "softmap": asked, "regularisation": regularisation, "gradient": gradient}
         answer = answered(client, screen, spec, "energy")
@@ -127,11 +127,11 @@ def basis(
 ) -> None:
     """Partition of unity on MESH; --out writes its functions as a sparse matrix (CSR)."""
     screen = Screen(json)
-    with _service(screen, url, data) as client:
+    with asking(screen, url, data) as client:
         uploaded = client.mesh(mesh)
         spec = BasisOptions(size, method, cutoff, sharpness).spec(uploaded.id)
         answer = answered(client, screen, spec, "basis")
-        _finish(client, screen, answer, out)
+        finish(client, screen, answer, out)
 
 
 def softmap(
@@ -152,9 +152,9 @@ def softmap(
     screen = Screen(json)
     bases = BasisOptions(method=method, cutoff=cutoff, sharpness=sharpness)
     pair = Pair(source, target, map, size, bases, sigma)
-    with _service(screen, url, data, pair) as client:
+    with asking(screen, url, data, pair) as client:
         asked, _ = pair.softmap(client)
-        _finish(client, screen, answered(client, screen, asked, "map"), out)
+        finish(client, screen, answered(client, screen, asked, "map"), out)
 
 
 def potential(
@@ -176,16 +176,14 @@ def potential(
     screen = Screen(json)
     bases = BasisOptions(method=method, cutoff=cutoff, sharpness=sharpness)
     pair = Pair(source, target, map, size, bases, sigma)
-    with _service(screen, url, data, pair) as client:
+    with asking(screen, url, data, pair) as client:
         asked, _ = pair.softmap(client)
         spec = {"kind": "potential", "softmap": asked, "regularisation": regularisation}
-        _finish(client, screen, answered(client, screen, spec, "potential"), out)
+        finish(client, screen, answered(client, screen, spec, "potential"), out)
 
 
 @contextmanager
-def _service(
-    screen: Screen, url: str | None, data: Path | None, pair: Pair | None = None
-) -> Iterator[Client]:
+def asking(screen: Screen, url: str | None, data: Path | None, pair: Pair | None = None) -> Iterator[Client]:
     """Client of the service that the options mean; what goes wrong in the block ends the command in words."""
     settings = settings_in_words(screen, data=data)
     interrupt_on_termination()
@@ -196,7 +194,7 @@ def _service(
             yield client
 
 
-def _finish(client: Client, screen: Screen, answer: Artifact, out: Path | None) -> None:
+def finish(client: Client, screen: Screen, answer: Artifact, out: Path | None) -> None:
     """Show an artifact and write its arrays."""
     files = [] if out is None else [save_arrays(client, answer, out, answer.kind)]
     shapes = {name: list(array["shape"]) for name, array in answer.arrays.items()}

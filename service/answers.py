@@ -160,3 +160,53 @@ class Energies:
     dirichlet_density: NDArray[np.float64]
     bijectivity_density: NDArray[np.float64]
     gradients: Mapping[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How mass moves on the target as source points move.
+
+    Attributes
+    ----------
+    id : str
+        Of the momentum artifact.
+    velocity : ndarray, (F, 3) or (k, F, 3) float64
+        In the units of the uploaded target, per target face.
+    momentum : ndarray, (F, 3) or (k, F, 3) float64
+        Velocity times the density of mass, whose mean is 1.
+    """
+
+    id: str
+    velocity: NDArray[np.float64]
+    momentum: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class TracedPath:
+    """A path on the target, and where the path that it follows was meanwhile on the source.
+
+    Attributes
+    ----------
+    id : str
+        Of the path artifact.
+    length : float
+        In the units of the uploaded target.
+    stopped : str
+        ``end`` if the source path was followed to its end; else what stopped it.
+    points, source_points : ndarray, (k, 3) float64
+        In the units of the uploaded meshes.
+    faces, source_faces : ndarray, (k,) int64
+        The face that each point is in.
+    barycentric, source_barycentric : ndarray, (k, 3) float64
+        Weights of the corners of that face.
+    """
+
+    id: str
+    length: float
+    stopped: str
+    points: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    barycentric: NDArray[np.float64]
+    source_points: NDArray[np.float64]
+    source_faces: NDArray[np.int64]
+    source_barycentric: NDArray[np.float64]

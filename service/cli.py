@@ -8,6 +8,7 @@ import typer
 
 from service.answering import basis, energy, potential, softmap
 from service.demo import demo
+from service.moving import momentum, path
 from service.operating import api, jobs, up, worker
 
 app = typer.Typer(
@@ -24,6 +25,8 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "basis": basis,
     "map": softmap,
     "potential": potential,
+    "momentum": momentum,
+    "path": path,
     "jobs": jobs,
     "worker": worker,
     "api": api,

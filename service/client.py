@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from service.answers import Artifact, Energies, Job, Upload
+from service.answers import Artifact, Energies, Job, Motion, TracedPath, Upload
 from service.asking import BasisOptions, map_kind, named_map, softmap
 from service.session import MeshLike, Session
 
+#: A soft map: its spec or its id.
+SoftMapLike = Mapping[str, Any] | str
 _MESH_ID = re.compile(r"mesh-[0-9a-f]{32}")
 
 
@@ -87,16 +89,129 @@ class Client(Session):
         Unusable
             If the map fits neither the vertices nor a matrix.
         """
+        asked = self.softmap(
+            source, target, map, size=size, method=method, cutoff=cutoff, sharpness=sharpness, sigma=sigma
+        )
+        spec = {"kind": "energy", "softmap": asked, "regularisation": regularisation, "gradient": gradient}
+        job = self.wait(self.submit(spec).id, progress, timeout)
+        return self.energies(job.id, asked["source"]["mesh"], asked["target"]["mesh"])
+
+    def softmap(
+        self,
+        source: MeshLike,
+        target: MeshLike,
+        map: str | ArrayLike = "wks",
+        *,
+        size: int = 300,
+        method: str | None = None,
+        cutoff: float | None = None,
+        sharpness: float | None = None,
+        sigma: float | None = None,
+    ) -> dict[str, Any]:
+        """Spec of a soft map between two meshes, which are uploaded, for `momentum`, `path` and `submit`.
+
+        Parameters
+        ----------
+        source, target, map, size, method, cutoff, sharpness, sigma
+            As in `energy`.
+
+        Returns
+        -------
+        dict
+            With both bases inline.
+
+        Raises
+        ------
+        ClientError
+            If the meshes or the map cannot be uploaded.
+        Unusable
+            If the map fits neither the vertices nor a matrix.
+        """
         m0, m = self.mesh(source), self.mesh(target)
         options = BasisOptions(size, method, cutoff, sharpness)
-        spec = {
-            "kind": "energy",
-            "softmap": softmap(options.spec(m0.id), options.spec(m.id), self.map_spec(map, m0, m, sigma)),
-            "regularisation": regularisation,
-            "gradient": gradient,
-        }
+        return softmap(options.spec(m0.id), options.spec(m.id), self.map_spec(map, m0, m, sigma))
+
+    def momentum(
+        self,
+        softmap: SoftMapLike,
+        face: int | Sequence[int],
+        direction: ArrayLike,
+        *,
+        regularisation: float = 1e-5,
+        progress: Callable[[Job], None] | None = None,
+        timeout: float | None = None,
+    ) -> Motion:
+        """How mass moves on the target as a source point moves, or several.
+
+        Parameters
+        ----------
+        softmap : mapping or str
+            Spec, such as `softmap` returns, or id.
+        face : int or sequence of int
+            Source faces.
+        direction : (3,) or (k, 3) array_like
+            Where the point moves in each.
+        regularisation, progress, timeout
+            As in `energy`.
+
+        Returns
+        -------
+        Motion
+            Velocity and momentum in every target face.
+
+        Raises
+        ------
+        ClientError
+            `Invalid`, `JobFailed`, `WaitedTooLong` and others; see ``service.refusals``.
+        """
+        faces = face if isinstance(face, int) else [int(one) for one in face]
+        question = {"face": faces, "direction": np.asarray(direction, dtype=np.float64).tolist()}
+        spec = {"kind": "momentum", "softmap": softmap, **question, "regularisation": regularisation}
         job = self.wait(self.submit(spec).id, progress, timeout)
-        return self.energies(job.id, m0.id, m.id)
+        return Motion(id=job.id, **self.arrays(job.id))
+
+    def path(
+        self,
+        softmap: SoftMapLike,
+        source_path: Sequence[int],
+        start: int,
+        *,
+        step: float = 0.01,
+        regularisation: float = 1e-5,
+        progress: Callable[[Job], None] | None = None,
+        timeout: float | None = None,
+    ) -> TracedPath:
+        """Path on the target that follows a path on the source.
+
+        Parameters
+        ----------
+        softmap : mapping or str
+            Spec, such as `softmap` returns, or id.
+        source_path : sequence of int
+            Source vertices, joined by shortest paths.
+        start : int
+            Target vertex that the first of them corresponds to.
+        step : float
+            Longest step along the source path, in √area of the source.
+        regularisation, progress, timeout
+            As in `energy`.
+
+        Returns
+        -------
+        TracedPath
+
+        Raises
+        ------
+        ClientError
+            `Invalid`, `JobFailed`, `WaitedTooLong` and others; see ``service.refusals``.
+        """
+        question = {"source_path": [int(one) for one in source_path], "start": int(start), "step": step}
+        spec = {"kind": "path", "softmap": softmap, **question, "regularisation": regularisation}
+        job = self.wait(self.submit(spec).id, progress, timeout)
+        values = self.artifact(job.id).values
+        return TracedPath(
+            id=job.id, length=values["length"], stopped=values["stopped"], **self.arrays(job.id)
+        )
 
     def map_spec(
         self, map: str | ArrayLike, source: Upload, target: Upload, sigma: float | None = None

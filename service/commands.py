@@ -48,6 +48,19 @@ def map_option(value: str) -> str:
     return value
 
 
+def vertices_option(value: str) -> str:
+    """Check that an option is a list of vertices, joined by commas.
+
+    Raises
+    ------
+    typer.BadParameter
+        If it is none.
+    """
+    if not re.fullmatch(r"[0-9]+(,[0-9]+)*", value, re.ASCII):
+        raise typer.BadParameter(f"{value} is no list of vertices such as 0,17,42")
+    return value
+
+
 @dataclass(frozen=True)
 class Pair:
     """Two meshes, a map between them, and bases: what the options say.

@@ -41,6 +41,24 @@ JOB_EXAMPLES: dict[str, dict[str, Any]] = {
         "summary": "Wave kernel signature at every vertex",
         "value": {"kind": "descriptor", "mesh": _MESH, "type": "wks", "count": 100, "eigenpairs": 200},
     },
+    "momentum": {
+        "summary": "Where mass flows on the target as a source point moves along the x axis in face 0",
+        "value": {
+            "kind": "momentum",
+            "softmap": "softmap-0123456789abcdef0123456789abcdef",
+            "face": 0,
+            "direction": [1.0, 0.0, 0.0],
+        },
+    },
+    "path": {
+        "summary": "The path on the target that follows one on the source",
+        "value": {
+            "kind": "path",
+            "softmap": "softmap-0123456789abcdef0123456789abcdef",
+            "source_path": [0, 17, 42],
+            "start": 0,
+        },
+    },
     "potential": {
         "summary": "Transportation potentials of a soft map that is known already",
         "value": {"kind": "potential", "softmap": "softmap-0123456789abcdef0123456789abcdef"},

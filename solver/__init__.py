@@ -47,7 +47,7 @@ from solver.errors import (
     SingularSystem,
     SolverError,
 )
-from solver.flow import momentum, velocity
+from solver.flow import mass_density, momentum, velocity
 from solver.maxent import maxent_basis
 from solver.mesh import Mesh
 from solver.potential import FACE_BLOCK, Potential, potential, potential_block
@@ -76,6 +76,7 @@ __all__ = [
     "gather_dirichlet",
     "hks",
     "hks_of",
+    "mass_density",
     "maxent_basis",
     "momentum",
     "poisson_basis",

@@ -76,9 +76,33 @@ def momentum(
     SolverError, SingularSystem
         As in `velocity`.
     """
-    faces, directions = _checked(softmap.source.mesh, face, direction)
-    found = _velocities(softmap, faces, directions, regularisation)
-    found *= _blended_density(softmap, faces, regularisation)[:, :, None]
+    found = velocity(softmap, face, direction, regularisation)
+    found *= mass_density(softmap, face, regularisation)[..., None]
+    return found
+
+
+def mass_density(softmap: SoftMap, face: int | npt.ArrayLike, regularisation: float = 1e-5) -> FloatArray:
+    """Density (1−ε) ρ(f, t) + ε of the mass that a source face sends to each target face.
+
+    Parameters
+    ----------
+    softmap, face, regularisation
+        As in `velocity`.
+
+    Returns
+    -------
+    ndarray of float64, shape (F,) or (k, F)
+        Its mean over the target is 1.
+
+    Raises
+    ------
+    SolverError
+        A face that does not exist; names the index.
+    """
+    faces = _checked_faces(softmap.source.mesh, face)
+    weights = softmap.source.face_means[faces] @ softmap.coefficients
+    density = (softmap.target.densities @ weights.T).T
+    found = np.asarray((1 - regularisation) * density + regularisation)
     return found[0] if np.ndim(face) == 0 else found
 
 
@@ -120,18 +144,11 @@ def _velocities(
     return scale * np.ascontiguousarray(vectors.T).reshape(len(faces), -1, 3)
 
 
-def _blended_density(softmap: SoftMap, faces: IntArray, regularisation: float) -> FloatArray:
-    """(1−ε) ρ(f, t) + ε, float64 (k, F)."""
-    weights = softmap.source.face_means[faces] @ softmap.coefficients
-    density = (softmap.target.densities @ weights.T).T
-    return np.asarray((1 - regularisation) * density + regularisation)
-
-
 def _checked(
     source: Mesh, face: int | npt.ArrayLike, direction: npt.ArrayLike
 ) -> tuple[IntArray, FloatArray]:
     """Faces (k,) and tangential directions (k, 3), or refuse them with the culprit."""
-    faces, directions = np.atleast_1d(np.asarray(face)), np.asarray(direction)
+    directions = np.asarray(direction)
     if directions.dtype.kind not in "iuf":
         raise SolverError("a direction is three numbers", value=str(directions.dtype))
     if directions.shape != (*np.shape(face), 3) or np.ndim(face) > 1:
@@ -139,15 +156,27 @@ def _checked(
             f"{np.shape(face)} faces need directions of shape {(*np.shape(face), 3)}, not {directions.shape}"
         )
         raise SolverError(message, value=str(directions.shape))
-    if not np.issubdtype(faces.dtype, np.integer):
-        raise SolverError("a face is an integer, counted from 0", value=str(faces.dtype))
+    faces = _checked_faces(source, face)
     directions = directions.reshape(-1, 3).astype(np.float64)
     for k, (one, vector) in enumerate(zip(faces, directions, strict=True)):
-        if not 0 <= one < source.n_faces:
-            raise SolverError(f"face {one} is not one of 0 … {source.n_faces - 1}", index=k, value=int(one))
         if not np.isfinite(vector).all():
             raise SolverError(f"direction {k} is not finite", index=k, value=str(vector.tolist()))
         if not np.linalg.norm(source.frames[one] @ vector) > TANGENTIAL * np.linalg.norm(vector):
             message = f"direction {k} has no part along face {one}"
             raise SolverError(message, index=k, value=str(vector.tolist()))
-    return faces.astype(np.int64), directions
+    return faces, directions
+
+
+def _checked_faces(source: Mesh, face: int | npt.ArrayLike) -> IntArray:
+    """Faces (k,), or refuse them with the culprit."""
+    faces = np.atleast_1d(np.asarray(face))
+    if faces.ndim > 1 or not np.issubdtype(faces.dtype, np.integer):
+        message = f"a face is an integer, counted from 0, not {faces.dtype} of shape {faces.shape}"
+        raise SolverError(message, value=str(faces.dtype))
+    stray = np.flatnonzero((faces < 0) | (faces >= source.n_faces))
+    if stray.size:
+        k = int(stray[0])
+        raise SolverError(
+            f"face {faces[k]} is not one of 0 … {source.n_faces - 1}", index=k, value=int(faces[k])
+        )
+    return faces.astype(np.int64)

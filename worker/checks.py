@@ -34,9 +34,7 @@ def basis(spec: specs.Basis, sizes: Sizes, settings: Settings) -> Iterator[Flaw]
     elif spec.size < mesh.n_components:
         yield "/size", f"Each of the {mesh.n_components} components needs a function of its own"
     for k, vertex in enumerate(spec.first):
-        if vertex >= mesh.n_vertices:
-            place = "/first" if len(spec.first) == 1 else f"/first/{k}"
-            yield place, f"There is no vertex {vertex}, only 0 … {mesh.n_vertices - 1}"
+        yield from _vertex("/first" if len(spec.first) == 1 else f"/first/{k}", vertex, mesh.n_vertices)
 
 
 def spectrum(spec: specs.Spectrum, sizes: Sizes, settings: Settings) -> Iterator[Flaw]:
@@ -109,6 +107,28 @@ def _descriptors(spec: specs.SoftMap, source: BasisSize, target: BasisSize, size
         columns.append(width)
     if len(columns) == 2 and columns[0] != columns[1]:
         yield "/map/target", f"Descriptors of {columns[0]} and {columns[1]} columns cannot be compared"
+
+
+def momentum(spec: specs.Momentum, sizes: Sizes, settings: Settings) -> Iterator[Flaw]:
+    """The faces are faces of the source."""
+    n_faces = sizes.softmap(spec.softmap).source.mesh.n_faces
+    one = isinstance(spec.face, int)
+    for k, face in enumerate((spec.face,) if isinstance(spec.face, int) else spec.face):
+        if face >= n_faces:
+            yield "/face" if one else f"/face/{k}", f"There is no face {face}, only 0 … {n_faces - 1}"
+
+
+def path(spec: specs.Path, sizes: Sizes, settings: Settings) -> Iterator[Flaw]:
+    """The path passes vertices of the source, and starts at one of the target."""
+    ends = sizes.softmap(spec.softmap)
+    for k, vertex in enumerate(spec.source_path):
+        yield from _vertex(f"/source_path/{k}", vertex, ends.source.mesh.n_vertices)
+    yield from _vertex("/start", spec.start, ends.target.mesh.n_vertices)
+
+
+def _vertex(place: str, vertex: int, n_vertices: int) -> Iterator[Flaw]:
+    if vertex >= n_vertices:
+        yield place, f"There is no vertex {vertex}, only 0 … {n_vertices - 1}"
 
 
 def of_softmap(spec: specs.Spec, sizes: Sizes, settings: Settings) -> Iterator[Flaw]:

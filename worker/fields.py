@@ -109,6 +109,8 @@ Sharpness = Annotated[float, Field(ge=0.5, le=50)]
 Positive = Annotated[float, Field(gt=0)]
 #: Adding zero turns -0.0, which asks the same question, into 0.0.
 Weight = Annotated[float, Field(ge=0), AfterValidator(lambda weight: weight + 0.0)]
+#: A component of a vector; -0.0 is 0.0 here too.
+Component = Annotated[float, AfterValidator(lambda component: component + 0.0)]
 
 
 def as_tuple(value: object) -> object:
@@ -116,9 +118,21 @@ def as_tuple(value: object) -> object:
     return tuple(value) if isinstance(value, list) else value
 
 
+def as_three(value: object) -> object:
+    """Let a list of three, as JSON has it, stand for a tuple."""
+    if isinstance(value, list | tuple) and len(value) != 3:
+        raise PydanticCustomError("three", "Input should be three numbers")
+    return as_tuple(value)
+
+
 def one_as_tuple(value: object) -> object:
     """Let a single item stand for a tuple of one."""
     return tuple(value) if isinstance(value, list | tuple) else (value,)
+
+
+def one_or_many(value: object) -> str:
+    """Tell a list from a single item, for unions of both."""
+    return "many" if isinstance(value, list | tuple) else "one"
 
 
 def validated(model: type[Model], fields: Mapping[str, Any], pointer: str) -> Model:
@@ -158,7 +172,7 @@ def _pointer(location: tuple[int | str, ...], value: object) -> str:
                 continue
             value = value.get(step)
             pointer += escaped(step)
-        elif isinstance(value, list | tuple) and isinstance(step, int):
+        elif isinstance(value, list | tuple) and isinstance(step, int) and step < len(value):
             value = value[step]
             pointer += f"/{step}"
     return pointer

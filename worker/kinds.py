@@ -6,15 +6,24 @@ A spec holds its parents as ids; bodies with inline parents become such specs in
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
-from pydantic import BeforeValidator, Field, ValidationInfo, field_serializer, field_validator
+from pydantic import (
+    BeforeValidator,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationInfo,
+    field_serializer,
+    field_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from worker.fields import (
     MAX_INTEGER,
     BasisId,
     Closed,
+    Component,
     Count,
     Eigenpairs,
     Fraction,
@@ -22,9 +31,16 @@ from worker.fields import (
     MeshId,
     Sharpness,
     SoftMapId,
+    as_three,
+    as_tuple,
     one_as_tuple,
+    one_or_many,
 )
 from worker.maps import Descriptors, Matrix, Mixture, NamedDescriptors, Points, Uniform
+
+#: Most faces of one question about momentum, and most vertices that one path may pass.
+MAX_MOTIONS: Final = 1_000
+MAX_STOPS: Final = 10_000
 
 
 class Spec(Closed):
@@ -152,6 +168,69 @@ class Energy(_OfSoftMap):
     version: ClassVar[int] = 1
     kind: Literal["energy"] = "energy"
     gradient: bool = False
+
+
+Vector = Annotated[tuple[Component, Component, Component], BeforeValidator(as_three)]
+
+
+def _vectors(value: object) -> str:
+    """Tell a list of vectors from one, whose items are no lists."""
+    inner = value[0] if isinstance(value, list | tuple) and value else None
+    return "many" if isinstance(inner, list | tuple) else "one"
+
+
+class Momentum(_OfSoftMap):
+    """Velocity and momentum of the mass, as the source point moves in one face or in several (§3.7)."""
+
+    version: ClassVar[int] = 1
+    kind: Literal["momentum"] = "momentum"
+    face: Annotated[
+        Annotated[Index, Tag("one")]
+        | Annotated[
+            tuple[Index, ...],
+            Field(min_length=1, max_length=MAX_MOTIONS, fail_fast=True),
+            BeforeValidator(as_tuple),
+            Tag("many"),
+        ],
+        Discriminator(one_or_many),
+    ]
+    #: In the units of the uploaded source; one for each face.
+    direction: Annotated[
+        Annotated[Vector, Tag("one")]
+        | Annotated[tuple[Vector, ...], Field(fail_fast=True), BeforeValidator(as_tuple), Tag("many")],
+        Discriminator(_vectors),
+    ]
+
+    @field_validator("direction")
+    @classmethod
+    def _one_for_each_face(cls, direction: Any, info: ValidationInfo) -> Any:
+        face = info.data.get("face")
+        many = isinstance(direction[0], tuple)
+        if isinstance(face, tuple) and (not many or len(direction) != len(face)):
+            raise PydanticCustomError(
+                "direction", "There should be a direction for each of {n} faces", {"n": len(face)}
+            )
+        if isinstance(face, int) and many:
+            raise PydanticCustomError("direction", "One face has one direction: three numbers")
+        if not all(any(vector) for vector in (direction if many else (direction,))):
+            raise PydanticCustomError("direction", "A direction should not be zero")
+        return direction
+
+
+class Path(_OfSoftMap):
+    """Path on the target that follows one on the source, from where that begins (§5.1)."""
+
+    version: ClassVar[int] = 1
+    kind: Literal["path"] = "path"
+    #: Source vertices, joined by shortest paths.
+    source_path: Annotated[
+        tuple[Index, ...],
+        Field(min_length=1, max_length=MAX_STOPS, fail_fast=True),
+        BeforeValidator(as_tuple),
+    ]
+    start: Index
+    #: Longest step along the source path, in √area of the source.
+    step: Annotated[float, Field(ge=1e-5, le=1)] = 0.01
 
 
 class _Block(_OfSoftMap):

@@ -222,6 +222,29 @@ def _potential(size: MapSize, n_faces: int) -> Cost:
     return Cost(seconds, solve_bytes(size, n_faces) + 2 * _FLOAT * row * n_faces)
 
 
+def momentum_cost(spec: specs.Momentum, sizes: Sizes) -> Cost:
+    """A solve of the faces that are asked for, and two vectors a target face for each."""
+    size = sizes.softmap(spec.softmap)
+    n_points = 1 if isinstance(spec.face, int) else len(spec.face)
+    n_faces = size.target.mesh.n_faces
+    seconds = solve_seconds(size, n_points) + 2e-7 * n_points * n_faces
+    return Cost(seconds, solve_bytes(size, n_points) + n_faces * (1_000 + 16 * _FLOAT * n_points))
+
+
+def path_cost(spec: specs.Path, sizes: Sizes) -> Cost:
+    """A shortest path to each next vertex, a solve of the faces it crosses, and a walk for each step."""
+    size = sizes.softmap(spec.softmap)
+    # A path of many vertices is taken for a smooth one: most are as near to the next as an edge is long.
+    n_stops = len(spec.source_path)
+    n_far = min(n_stops, 20)
+    across = size.source.mesh.n_faces**0.5
+    seconds = n_far * (1.2e-3 * across + 2e-6 * size.source.mesh.n_faces + 1e-4 / spec.step) + 2e-3 * n_stops
+    crossed = round(0.8 * across * n_far) + n_stops
+    row = 2 * size.target.n_functions + 6
+    memory = solve_bytes(size, crossed) + 4 * _FLOAT * row * crossed + 2_000 * round(n_far / spec.step)
+    return Cost(solve_seconds(size, crossed) + seconds, memory + 3_000 * size.source.mesh.n_faces)
+
+
 def gathering_cost(size: MapSize, n_faces: int, gradient: bool) -> Cost:
     """Adding up the shards of an energy, or naming those of a potential."""
     entries = size.source.n_functions * size.target.n_functions

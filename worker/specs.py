@@ -23,7 +23,9 @@ from worker.kinds import (
     Energy,
     EnergyBlock,
     MaxentBasis,
+    Momentum,
     NamedSoftMap,
+    Path,
     PoissonBasis,
     Potential,
     PotentialBlock,
@@ -56,8 +58,10 @@ __all__ = [
     "Matrix",
     "MaxentBasis",
     "Mixture",
+    "Momentum",
     "NamedDescriptors",
     "NamedSoftMap",
+    "Path",
     "Points",
     "PoissonBasis",
     "Potential",
@@ -81,7 +85,18 @@ __all__ = [
 #: Every kind that has a spec, public ones first.
 KINDS: Final[Mapping[str, type[Spec]]] = {
     model.model_fields["kind"].default: model
-    for model in (Basis, Spectrum, Descriptor, SoftMap, Potential, Energy, PotentialBlock, EnergyBlock)
+    for model in (
+        Basis,
+        Spectrum,
+        Descriptor,
+        SoftMap,
+        Potential,
+        Energy,
+        Momentum,
+        Path,
+        PotentialBlock,
+        EnergyBlock,
+    )
 }
 #: Every model that a question is an instance of: a basis has one for each method.
 MODELS: Final = (*BASES.values(), *(model for model in KINDS.values() if model is not Basis))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from worker import checks, ingredients, sizes, solves, specs
+from worker import checks, ingredients, motion, sizes, solves, specs
 from worker.bench import Bench, Made
 from worker.settings import Settings
 from worker.sizes import Cost, Sizes
@@ -48,6 +48,8 @@ STAGES: Final[Mapping[type[specs.Spec], Stage]] = {
     specs.PotentialBlock: Stage(solves.make_potential_block, sizes.potential_block_cost),
     specs.Energy: Stage(solves.make_energy, sizes.energy_cost, shards=solves.energy_shards),
     specs.EnergyBlock: Stage(solves.make_energy_block, sizes.energy_block_cost),
+    specs.Momentum: Stage(motion.make_momentum, sizes.momentum_cost, checks.momentum),
+    specs.Path: Stage(motion.make_path, sizes.path_cost, checks.path),
 }
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.cli import COMMANDS
 from service.client import Client
 from service.off import off
 from service.stack import Stack
@@ -64,7 +65,7 @@ def spoken(done: subprocess.CompletedProcess[str]) -> str:
 def test_help_names_every_command() -> None:
     done = softmaps("--help")
     assert done.returncode == DONE
-    for command in ("up", "demo", "energy", "basis", "map", "potential", "jobs", "worker", "api"):
+    for command in COMMANDS:
         assert f" {command} " in done.stdout
 
 
@@ -77,6 +78,7 @@ def test_help_names_every_command() -> None:
         (["energy", "SPHERE", "SPHERE", "--map", "sks"], "sks is neither wks, hks, uniform nor a file"),
         (["energy", "SPHERE", "SPHERE", "--size", "many"], "valid integer"),
         (["energy", "SPHERE", "SPHERE", "--up", "w"], "is x, y or z"),
+        (["path", "SPHERE", "SPHERE", "--start", "0", "--source-path", "0-4"], "no list of vertices"),
         (["jobs", "--dismiss"], "name the job to dismiss"),
         (["worker"], "SOFTMAPS_REDIS_URL must name a Redis"),
         (["api"], "SOFTMAPS_REDIS_URL must name a Redis"),
@@ -169,6 +171,23 @@ def test_maps_that_are_refused(stack: Stack, sphere: Path, tmp_path: Path) -> No
     assert done.returncode == FAILED
     assert "maps are read from .txt and .npy" in spoken(done)
     assert not (tmp_path / "data").exists()
+
+
+def test_momentum_and_paths(stack: Stack, sphere: Path, tmp_path: Path) -> None:
+    def asked(*arguments: object) -> dict[str, object]:
+        common = ("--map", "hks", "--size", 10, "--out", tmp_path, "--json", "--url", stack.url)
+        done = softmaps(*arguments, *common)
+        assert done.returncode == DONE, done.stderr
+        answer: dict[str, object] = json.loads(done.stdout)
+        return answer
+
+    asked("momentum", sphere, sphere, "--face", 3, "--direction", -1, 0, 0.5)
+    with np.load(tmp_path / "momentum.npz") as arrays:
+        assert arrays["velocity"].shape == arrays["momentum"].shape == (320, 3)
+    found = asked("path", sphere, sphere, "--source-path", "0,40,100", "--start", 7)
+    with np.load(tmp_path / "path.npz") as arrays:
+        assert found["arrays"]["points"] == list(arrays["points"].shape)
+    assert found["values"]["stopped"] == "end"
 
 
 def test_failures_are_said_in_words_and_in_json(stack: Stack, sphere: Path, tmp_path: Path) -> None:

@@ -128,6 +128,30 @@ def test_energies_of_the_three_kinds_of_map(client: Client, sphere: Mesh) -> Non
     )
 
 
+def test_momentum_and_paths(client: Client, sphere: Mesh) -> None:
+    identity = client.softmap(sphere, sphere, np.arange(len(sphere[0])), size=12)
+    one = client.momentum(identity, 5, [1.0, 0.5, 0.25], timeout=60)
+    assert one.velocity.shape == one.momentum.shape == (len(sphere[1]), 3)
+    # A soft map may be named by its id, once it is there; each of several faces is as if asked alone.
+    softmap = client.artifact(one.id).parents["softmap"]
+    both = client.momentum(softmap, np.array([9, 5]), [[0, 0, 1], [2.0, 1.0, 0.5]], timeout=60)
+    assert both.momentum.shape == (2, len(sphere[1]), 3)
+    assert np.allclose(both.momentum[1], 2 * one.momentum, rtol=1e-9, atol=1e-12)
+
+    followed = client.path(softmap, [0, 40, 100], 0, step=0.05, timeout=60)
+    assert followed.stopped == "end"
+    corners = sphere[0][sphere[1][followed.faces]]
+    assert np.allclose(followed.points, np.einsum("kc,kcx->kx", followed.barycentric, corners))
+    assert np.allclose(followed.source_points[[0, -1]], sphere[0][[0, 100]])
+    steps = np.linalg.norm(np.diff(followed.points, axis=0), axis=1)
+    assert 0 < steps.sum() <= followed.length * (1 + 1e-12)
+
+    with pytest.raises(Invalid, match="/face/1"):
+        client.momentum(softmap, [0, 320], [[1, 0, 0]] * 2)
+    with pytest.raises(Invalid, match="/start"):
+        client.path(softmap, [0], 162)
+
+
 def test_the_lineage_has_parents_first(client: Client, sphere: Mesh) -> None:
     found = client.energy(sphere, sphere, "uniform", size=12, timeout=120)
     lineage = client.lineage(found.id)

@@ -8,7 +8,7 @@ import pytest
 from solver.basis import Basis
 from solver.errors import SolverError
 from solver.fem import mass
-from solver.flow import momentum, velocity
+from solver.flow import mass_density, momentum, velocity
 from solver.maxent import maxent_basis
 from solver.mesh import Mesh
 from solver.potential import potential
@@ -69,6 +69,10 @@ def test_momentum_is_density_times_velocity(peaked: SoftMap) -> None:
     density = 0.75 * (peaked.target.densities @ weights) + 0.25
     expected = density[:, None] * velocity(peaked, face, direction, epsilon)
     np.testing.assert_allclose(momentum(peaked, face, direction, epsilon), expected, atol=ROUNDING)
+    np.testing.assert_allclose(mass_density(peaked, [face], epsilon), [density], atol=ROUNDING)
+    assert peaked.target.mesh.face_areas @ mass_density(peaked, face, epsilon) == pytest.approx(1, rel=1e-12)
+    with pytest.raises(SolverError, match="face 10000 is not one of"):
+        mass_density(peaked, [0, 10_000])
 
 
 def test_both_are_linear_in_the_direction(peaked: SoftMap) -> None:

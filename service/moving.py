@@ -1,0 +1,90 @@
+"""The commands that follow mass: `momentum` and `path`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from service.answering import asking, finish
+from service.asking import BasisOptions
+from service.commands import Pair, answered, vertices_option
+from service.console import Screen
+from service.options import (
+    Cutoff,
+    Data,
+    Json,
+    MapOption,
+    Method,
+    Out,
+    Regularisation,
+    Sharpness,
+    Sigma,
+    Size,
+    Source,
+    Target,
+    Url,
+)
+
+
+def momentum(
+    source: Source,
+    target: Target,
+    face: Annotated[int, typer.Option(min=0, help="Source face, counted from 0.")],
+    direction: Annotated[
+        tuple[float, float, float], typer.Option(help="Where the source point moves: three numbers.")
+    ],
+    map: MapOption = "wks",
+    size: Size = None,
+    method: Method = None,
+    cutoff: Cutoff = None,
+    sharpness: Sharpness = None,
+    sigma: Sigma = None,
+    regularisation: Regularisation = 1e-5,
+    url: Url = None,
+    data: Data = None,
+    out: Out = None,
+    json: Json = False,
+) -> None:
+    """How mass moves on TARGET as a point of SOURCE moves; --out writes velocity and momentum (F×3)."""
+    screen = Screen(json)
+    bases = BasisOptions(method=method, cutoff=cutoff, sharpness=sharpness)
+    pair = Pair(source, target, map, size, bases, sigma)
+    with asking(screen, url, data, pair) as client:
+        asked, _ = pair.softmap(client)
+        question = {"face": face, "direction": list(direction), "regularisation": regularisation}
+        spec = {"kind": "momentum", "softmap": asked, **question}
+        finish(client, screen, answered(client, screen, spec, "momentum"), out)
+
+
+def path(
+    source: Source,
+    target: Target,
+    source_path: Annotated[
+        str,
+        typer.Option(callback=vertices_option, help="Source vertices that the path passes, such as 0,17,42."),
+    ],
+    start: Annotated[int, typer.Option(min=0, help="Target vertex that the first of them corresponds to.")],
+    step: Annotated[float, typer.Option(help="Longest step, in √area of the source.")] = 0.01,
+    map: MapOption = "wks",
+    size: Size = None,
+    method: Method = None,
+    cutoff: Cutoff = None,
+    sharpness: Sharpness = None,
+    sigma: Sigma = None,
+    regularisation: Regularisation = 1e-5,
+    url: Url = None,
+    data: Data = None,
+    out: Out = None,
+    json: Json = False,
+) -> None:
+    """Path on TARGET that follows a path on SOURCE; --out writes its points (k×3) and where they are."""
+    screen = Screen(json)
+    bases = BasisOptions(method=method, cutoff=cutoff, sharpness=sharpness)
+    pair = Pair(source, target, map, size, bases, sigma)
+    with asking(screen, url, data, pair) as client:
+        asked, _ = pair.softmap(client)
+        passed = [int(vertex) for vertex in source_path.split(",")]
+        question = {"source_path": passed, "start": start, "step": step, "regularisation": regularisation}
+        spec = {"kind": "path", "softmap": asked, **question}
+        finish(client, screen, answered(client, screen, spec, "path"), out)
