@@ -37,6 +37,10 @@ JOB_EXAMPLES: dict[str, dict[str, Any]] = {
         "summary": "A basis of 300 functions that reproduces linear functions, so that densities converge",
         "value": {"kind": "basis", "mesh": _MESH, "size": 300, "method": "maxent", "sharpness": 3.0},
     },
+    "spectrum": {
+        "summary": "The first 200 eigenpairs of a mesh's Laplacian",
+        "value": {"kind": "spectrum", "mesh": _MESH, "eigenpairs": 200},
+    },
     "descriptor": {
         "summary": "Wave kernel signature at every vertex",
         "value": {"kind": "descriptor", "mesh": _MESH, "type": "wks", "count": 100, "eigenpairs": 200},
