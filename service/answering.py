@@ -59,7 +59,8 @@ def energy(
     json: Json = False,
 ) -> None:
     """Energies of a soft map from SOURCE to TARGET; --out also writes densities and a picture."""
-    from service.pictures import View, bijectivity_panel, dirichlet_panel, write  # noqa: PLC0415
+    from service.pictures import bijectivity_panel, dirichlet_panel, write  # noqa: PLC0415
+    from service.rasteriser import View  # noqa: PLC0415
 
     if up_axis not in {"x", "y", "z"}:
         raise typer.BadParameter("is x, y or z", param_hint="--up")

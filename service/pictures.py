@@ -1,4 +1,4 @@
-"""Pictures of densities on meshes without a display: a small z-buffer rasteriser, matplotlib around it.
+"""Pictures of values on meshes with what a reader must know about them, drawn without a display.
 
 The Dirichlet density is shown on a logarithmic scale (it spans decades), the bijectivity density by its
 reciprocal, as in the paper's figures.
@@ -6,20 +6,20 @@ reciprocal, as in the paper's figures.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from service.marks import Floats, Ints, Mark
+from service.rasteriser import View, render
 
 if TYPE_CHECKING:
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: Percentiles of a density that its colours span: a few extreme faces must not flatten the rest.
 LOWEST, HIGHEST = 4.0, 99.0
@@ -29,46 +29,49 @@ LEAST_RATIO = 1.01
 DECADES = 5.0
 #: Ratio of its ends from which a logarithmic scale has a label a decade.
 WIDE = 100.0
-#: Samples per pixel and direction; edges are smooth because they are averaged.
-OVERSAMPLING = 2
-#: Fragments rasterised at once: a few hundred megabytes at most, whatever the mesh.
-FRAGMENTS = 1_000_000
-#: Lights as seen by the camera: direction (right, up, towards), strength. The rest is ambient light.
-LIGHTS = (((-0.45, 0.65, 0.62), 0.62), ((0.75, 0.10, 0.65), 0.22))
-AMBIENT = 0.34
+#: Width and height of a panel, and how much of the height title and colour bar take, in inches.
 PANEL_INCHES = (5.2, 4.4)
+TITLE_INCHES, BAR_INCHES = 0.3, 0.55
 DPI = 120
-
-
-@dataclass(frozen=True)
-class View:
-    """Where the camera stands: degrees around the upward axis (0, 1 or 2) and above the horizon."""
-
-    azimuth: float = 38.0
-    elevation: float = 14.0
-    up: int = 2
-
-    def axes(self) -> Floats:
-        """Rows: right, up and towards the camera, as vectors of the mesh's space."""
-        a, e = np.radians(self.azimuth), np.radians(self.elevation)
-        towards = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-        right = np.array([-np.sin(a), np.cos(a), 0.0])
-        # A cyclic shift of the axes keeps the handedness.
-        axes: Floats = np.roll(np.stack([right, np.cross(towards, right), towards]), self.up - 2, axis=1)
-        return axes
 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One mesh with one value per face (or per vertex) and what a reader must know about it."""
+    """One mesh with one value or colour per face or vertex, and what a reader must know about it.
+
+    Attributes
+    ----------
+    vertices, faces : ndarray, (V, 3) float and (F, 3) int
+        The mesh.
+    values : ndarray, (F,), (V,), (F, 3) or (V, 3) float
+        Values for a scale of colours; or red, green and blue in [0, 1].
+    title : str
+        Above the mesh.
+    label : str
+        What the values are, for the colour bar; "" if there is none.
+    logarithmic : bool
+        Whether the scale of colours is.
+    colours : str
+        What matplotlib calls the colours.
+    limits : (float, float), optional
+        Ends of the scale; else most of the values lie between them. Neighbours with the same limits and label
+        share a colour bar.
+    marks : tuple of Mark
+        Drawn with the mesh.
+    view : View, optional
+        Camera; else that of the figure.
+    """
 
     vertices: Floats
     faces: Ints
     values: Floats
     title: str
-    label: str
+    label: str = ""
     logarithmic: bool = False
     colours: str = "viridis"
+    limits: tuple[float, float] | None = None
+    marks: tuple[Mark, ...] = ()
+    view: View | None = None
 
 
 def dirichlet_panel(vertices: Floats, faces: Ints, density: Floats, energy: float, name: str) -> Panel:
@@ -119,15 +122,24 @@ def bijectivity_panel(vertices: Floats, faces: Ints, density: Floats, energy: fl
     return Panel(vertices, faces, reciprocal, title, "1 / bijectivity density: target area per unit mass")
 
 
-def figure(rows: Sequence[Sequence[Panel]], view: View | None = None) -> Figure:
-    """Meshes side by side, each with its colour bar.
+def figure(
+    rows: Sequence[Sequence[Panel]],
+    view: View | None = None,
+    inches: tuple[float, float] = PANEL_INCHES,
+    dpi: float = DPI,
+) -> Figure:
+    """Meshes side by side, with their colour bars.
 
     Parameters
     ----------
     rows : sequence of sequences of Panel
         The grid of panels; all rows are equally long.
     view : View, optional
-        Camera of every panel; a three-quarter view with z up unless given.
+        Camera of panels that have none of their own; a three-quarter view with z up unless given.
+    inches : (float, float)
+        Width and height of a panel with its title and colour bar.
+    dpi : float
+        Pixels an inch.
 
     Returns
     -------
@@ -142,32 +154,72 @@ def figure(rows: Sequence[Sequence[Panel]], view: View | None = None) -> Figure:
     # Importing matplotlib takes half a second, which commands without pictures need not wait for.
     from matplotlib.cm import ScalarMappable  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
-    from matplotlib.ticker import FuncFormatter, LogLocator  # noqa: PLC0415
 
-    width, height = PANEL_INCHES
-    drawing = Figure(figsize=(width * len(rows[0]), height * len(rows)), dpi=DPI, layout="constrained")
+    width, height = inches
+    drawing = Figure(figsize=(width * len(rows[0]), height * len(rows)), dpi=dpi, layout="constrained")
     grid = drawing.subplots(len(rows), len(rows[0]), squeeze=False)
     for line, row in zip(grid, rows, strict=True):
+        below = BAR_INCHES if any(panel.label for panel in row) else 0.0
+        above = TITLE_INCHES if any(panel.title for panel in row) else 0.0
+        pixels = round(width * dpi), round((height - above - below) * dpi)
         for axes, panel in zip(line, row, strict=True):
-            scale = ScalarMappable(_scale(panel), panel.colours)
-            picture = render(panel.vertices, panel.faces, scale.to_rgba(panel.values)[:, :3], view or View())
-            axes.imshow(picture, interpolation="antialiased")
+            axes.imshow(_drawn(panel, panel.view or view or View(), pixels), interpolation="antialiased")
             axes.set_axis_off()
             axes.set_title(panel.title, fontsize=12)
+        for panel, sharing in _sharing(line, row):
+            scale = ScalarMappable(_scale(panel), panel.colours)
             bar = drawing.colorbar(
-                scale, ax=axes, location="bottom", shrink=0.7, aspect=32, pad=0.02, extend="both"
+                scale, ax=sharing, location="bottom", shrink=0.7, aspect=32, pad=0.02, extend="both"
             )
-            bar.set_label(panel.label, fontsize=9)
-            if panel.logarithmic:
-                low, high = scale.get_clim()
-                # One label a decade, or three where there are few decades.
-                bar.locator = LogLocator(subs=(1.0,) if high > WIDE * low else (1.0, 2.0, 5.0))
-                bar.formatter = FuncFormatter(lambda value, _position: f"{value:g}")
-                bar.minorticks_off()
-                bar.update_ticks()
-            bar.ax.tick_params(labelsize=8)
-            bar.outline.set_visible(False)
+            _label(bar, panel, scale.get_clim())
     return drawing
+
+
+def _sharing(line: Sequence[Any], row: Sequence[Panel]) -> Iterator[tuple[Panel, list[Any]]]:
+    """Panels that have a colour bar, each with the axes that share it."""
+    positions = {
+        k: (k if panel.limits is None else -1, panel.limits, panel.label) for k, panel in enumerate(row)
+    }
+    for _, group in groupby(positions, positions.__getitem__):
+        members = list(group)
+        if row[members[0]].label:
+            yield row[members[0]], [line[k] for k in members]
+
+
+def _label(bar: Any, panel: Panel, limits: tuple[float, float]) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator  # noqa: PLC0415  (see `figure`)
+
+    bar.set_label(panel.label, fontsize=9)
+    if panel.logarithmic:
+        low, high = limits
+        # One label a decade, or three where there are few decades.
+        bar.locator = LogLocator(subs=(1.0,) if high > WIDE * low else (1.0, 2.0, 5.0))
+        bar.formatter = FuncFormatter(lambda value, _position: f"{value:g}")
+        bar.minorticks_off()
+        bar.update_ticks()
+    bar.ax.tick_params(labelsize=8)
+    bar.outline.set_visible(False)
+
+
+def _drawn(panel: Panel, view: View, size: tuple[int, int]) -> Any:
+    """Rendered mesh with its marks."""
+    from matplotlib.cm import ScalarMappable  # noqa: PLC0415  (see `figure`)
+
+    colours = panel.values
+    if colours.ndim == 1:
+        colours = ScalarMappable(_scale(panel), panel.colours).to_rgba(colours)[:, :3]
+    flat = len(colours) == len(panel.faces)
+    if not flat and len(colours) != len(panel.vertices):
+        # Marks would hide the mismatch.
+        return render(panel.vertices, panel.faces, colours, view, size)
+    vertices, faces, paint = [panel.vertices], [panel.faces], [colours]
+    offset = len(panel.vertices)
+    for mark in panel.marks:
+        vertices.append(mark.vertices)
+        faces.append(mark.faces + offset)
+        paint.append(np.tile(mark.colour, (len(mark.faces if flat else mark.vertices), 1)))
+        offset += len(mark.vertices)
+    return render(np.concatenate(vertices), np.concatenate(faces), np.concatenate(paint), view, size)
 
 
 def write(path: Path, rows: Sequence[Sequence[Panel]], view: View | None = None) -> None:
@@ -192,134 +244,11 @@ def write(path: Path, rows: Sequence[Sequence[Panel]], view: View | None = None)
     figure(rows, view).savefig(path)
 
 
-def render(
-    vertices: Floats, faces: Ints, colours: Floats, view: View, size: tuple[int, int] = (620, 480)
-) -> NDArray[np.uint8]:
-    """Shaded picture of a coloured mesh, seen in parallel projection.
-
-    Parameters
-    ----------
-    vertices : ndarray, (V, 3) float
-        Positions.
-    faces : ndarray, (F, 3) int
-        Triangles.
-    colours : ndarray, (F, 3) or (V, 3) float
-        Red, green and blue in [0, 1] of faces (flat) or vertices (interpolated).
-    view : View
-        Camera.
-    size : (int, int)
-        Width and height in pixels.
-
-    Returns
-    -------
-    ndarray, (height, width, 4) uint8
-        Red, green, blue and opacity; the background is transparent.
-
-    Raises
-    ------
-    ValueError
-        If there is neither one colour per face nor one per vertex.
-    """
-    if len(colours) not in {len(faces), len(vertices)}:
-        raise ValueError(f"{len(colours)} values fit neither {len(faces)} faces nor {len(vertices)} vertices")
-    width, height = size[0] * OVERSAMPLING, size[1] * OVERSAMPLING
-    seen = vertices @ view.axes().T
-    low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
-    scale = 0.96 * min(width / max(high[0] - low[0], 1e-300), height / max(high[1] - low[1], 1e-300))
-    middle = (low + high) / 2
-    points = np.column_stack(
-        [
-            width / 2 + (seen[:, 0] - middle[0]) * scale,
-            height / 2 - (seen[:, 1] - middle[1]) * scale,
-            seen[:, 2] * scale,
-        ]
-    )
-    hit, weights = _rasterise(points, faces, width, height)
-    covered = np.flatnonzero(hit >= 0)
-    face, weight = hit[covered], weights[covered]
-    corners = faces[face]
-    normals = np.einsum("pk,pkx->px", weight, _vertex_normals(seen, faces)[corners])
-    # Both sides are lit, since a mesh may be open or inside out; the face decides which side it is, for the
-    # interpolated normal may point away at a silhouette.
-    a, b, c = (seen[faces[:, k]] for k in range(3))
-    away = np.cross(b - a, c - a)[:, 2] < 0.0
-    normals[away[face]] *= -1.0
-    flat = len(colours) == len(faces)
-    colour = colours[face] if flat else np.einsum("pk,pkx->px", weight, colours[corners])
-    # Eight bits a channel come out: single precision is plenty.
-    picture = np.zeros((height * width, 4), dtype=np.float32)
-    picture[covered, :3] = np.clip(colour * _light(normals)[:, None], 0.0, 1.0)
-    picture[covered, 3] = 1.0
-    picture = picture.reshape(size[1], OVERSAMPLING, size[0], OVERSAMPLING, 4).mean(axis=(1, 3))
-    # The mean of covered and empty samples darkens an edge's colour; opacity alone must tell.
-    picture[..., :3] /= np.maximum(picture[..., 3:], 1e-9)
-    pixels: NDArray[np.uint8] = np.round(255.0 * picture).astype(np.uint8)
-    return pixels
-
-
-def _rasterise(points: Floats, faces: Ints, width: int, height: int) -> tuple[Ints, Floats]:
-    """Frontmost face (−1: none) and barycentric weights at every pixel centre, row by row."""
-    hit = np.full(width * height, -1, dtype=np.int64)
-    weights = np.zeros((width * height, 3))
-    depth = np.full(width * height, -np.inf)
-    corners = points[faces]
-    low = np.clip(np.ceil(corners[:, :, :2].min(axis=1) - 0.5), 0, (width, height)).astype(np.int64)
-    high = np.clip(np.floor(corners[:, :, :2].max(axis=1) + 0.5), 0, (width, height)).astype(np.int64)
-    columns, rows = np.maximum(high - low, 0).T
-    # On a face the second and third weight and the depth are affine: a value at the first corner, two slopes.
-    a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
-    counts = np.where(area == 0.0, 0, columns * rows)
-    area = np.where(area == 0.0, 1.0, area)
-    slope_b = np.stack([ac[:, 1], -ac[:, 0]], axis=1) / area[:, None]
-    slope_c = np.stack([-ab[:, 1], ab[:, 0]], axis=1) / area[:, None]
-    ends = np.cumsum(counts)
-    start = 0
-    while start < len(faces):
-        before = ends[start] - counts[start]
-        stop = max(start + 1, int(np.searchsorted(ends, before + FRAGMENTS, side="right")))
-        face = np.repeat(np.arange(start, stop), counts[start:stop])
-        within = np.arange(before, before + len(face)) - (ends - counts)[face]
-        y, x = np.divmod(within, columns[face])
-        x += low[face, 0]
-        y += low[face, 1]
-        dx, dy = x + 0.5 - a[face, 0], y + 0.5 - a[face, 1]
-        wb = slope_b[face, 0] * dx + slope_b[face, 1] * dy
-        wc = slope_c[face, 0] * dx + slope_c[face, 1] * dy
-        inside = np.flatnonzero((wb >= 0.0) & (wc >= 0.0) & (wb + wc <= 1.0))
-        face, wb, wc, pixel = face[inside], wb[inside], wc[inside], (y * width + x)[inside]
-        z = a[face, 2] + wb * ab[face, 2] + wc * ac[face, 2]
-        front = np.flatnonzero(z > depth[pixel])
-        front = front[np.argsort(z[front], kind="stable")]
-        # Where an index repeats, the last value assigned stays: the frontmost.
-        depth[pixel[front]], hit[pixel[front]] = z[front], face[front]
-        weights[pixel[front]] = np.column_stack([1.0 - wb - wc, wb, wc])[front]
-        start = stop
-    return hit, weights
-
-
-def _vertex_normals(vertices: Floats, faces: Ints) -> Floats:
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normals = np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(normals, faces[:, k], np.cross(b - a, c - a))
-    return normals
-
-
-def _light(normals: Floats) -> Floats:
-    """Brightness at each normal."""
-    unit = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    brightness: Floats = AMBIENT + 0.10 * unit[:, 1]
-    for direction, strength in LIGHTS:
-        towards = np.array(direction) / np.linalg.norm(direction)
-        # Wrapped diffuse light: soft where the surface turns away.
-        brightness += strength * np.maximum((unit @ towards + 0.25) / 1.25, 0.0)
-    return brightness
-
-
 def _scale(panel: Panel) -> Normalize:
     from matplotlib.colors import LogNorm, Normalize  # noqa: PLC0415  (see `figure`)
 
+    if panel.limits is not None:
+        return LogNorm(*panel.limits) if panel.logarithmic else Normalize(*panel.limits)
     values = panel.values[np.isfinite(panel.values)]
     if panel.logarithmic:
         values = values[values > 0.0]

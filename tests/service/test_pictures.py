@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from service.creature import creature
+from service.marks import balls
 from service.pictures import (
     DECADES,
     Panel,
-    View,
     bijectivity_panel,
     dirichlet_panel,
     figure,
-    render,
     write,
 )
+from service.rasteriser import View, render
 
 #: Seen along −x: y to the right, z up, no perspective.
 FRONT = View(azimuth=0.0, elevation=0.0)
@@ -121,8 +121,28 @@ def test_any_density_makes_a_picture(density: np.ndarray, tmp_path: Path) -> Non
 
 def test_a_logarithmic_scale_spans_few_decades() -> None:
     vertices, faces = creature()
-    panel = Panel(vertices, faces, np.geomspace(1e-12, 10.0, len(faces)), "", "", logarithmic=True)
+    panel = Panel(vertices, faces, np.geomspace(1e-12, 10.0, len(faces)), "", "density", logarithmic=True)
     bar = figure([[panel]]).axes[1]
     low, high = bar.get_xlim()
     assert np.log10(high / low) <= DECADES + 1e-9
     assert 5.0 < high <= 10.0
+
+
+def test_neighbours_with_the_same_limits_share_a_colour_bar() -> None:
+    vertices, faces = square(0.0)
+    panels = [
+        Panel(vertices, faces, np.zeros(2), "", label, limits=(0.0, 1.0)) for label in ("a", "a", "b", "")
+    ]
+    drawing = figure([panels])
+    assert len(drawing.axes) == 4 + 2
+
+
+def test_colours_are_drawn_as_they_are_and_marks_with_them() -> None:
+    vertices, faces = square(0.0)
+    mark = balls(np.array([[1.0, 0.0, 0.0]]), 0.3, (0.0, 0.0, 1.0))
+    for n in (2, 4):
+        panel = Panel(vertices, faces, np.tile(RED, (n, 1)), "", marks=(mark,))
+        drawn = figure([[panel]], FRONT, inches=(1.0, 1.0), dpi=80).axes[0].images[0].get_array()
+        assert drawn.shape == (80, 80, 4)
+        assert drawn[40, 40, 2] > 0 == drawn[40, 40, 0]
+        assert drawn[8, 8, 0] > 0 == drawn[8, 8, 2]
