@@ -47,10 +47,14 @@ from solver.errors import (
     SingularSystem,
     SolverError,
 )
+from solver.feasible import LinearConstraint
 from solver.flow import mass_density, momentum, velocity
 from solver.maxent import maxent_basis
 from solver.mesh import Mesh
+from solver.optimal import OptimalMap, optimal_softmap
 from solver.potential import FACE_BLOCK, Potential, potential, potential_block
+from solver.prolongation import prolong
+from solver.search import Iteration
 from solver.softmap import SoftMap
 from solver.trace import Path, trace
 
@@ -63,7 +67,10 @@ __all__ = [
     "InvalidDescriptor",
     "InvalidMesh",
     "InvalidSoftMap",
+    "Iteration",
+    "LinearConstraint",
     "Mesh",
+    "OptimalMap",
     "Path",
     "Potential",
     "SingularSystem",
@@ -79,9 +86,11 @@ __all__ = [
     "mass_density",
     "maxent_basis",
     "momentum",
+    "optimal_softmap",
     "poisson_basis",
     "potential",
     "potential_block",
+    "prolong",
     "spectrum",
     "trace",
     "velocity",
