@@ -51,6 +51,23 @@ class Tensor(NamedTuple):
     diagonal: IntArray
 
 
+class Rows(NamedTuple):
+    """Entries of every row of A, on both sides of the diagonal.
+
+    Attributes
+    ----------
+    start : ndarray of int64, shape (n + 1,)
+        Where each row's entries start.
+    entry : ndarray of int64, shape (·,)
+        Place among the tensor's entries.
+    column : ndarray of int64, shape (·,)
+    """
+
+    start: IntArray
+    entry: IntArray
+    column: IntArray
+
+
 class Target(NamedTuple):
     """All that kernels read of a target basis.
 
@@ -59,6 +76,7 @@ class Target(NamedTuple):
     panels : Panels
     entries : Entries
     tensor : Tensor
+    rows : Rows
     integrals : ndarray of float64, shape (1, n)
         ∫βⱼ; here, in C and in CU, n is rounded up to an even number by a column of zeros.
     """
@@ -66,6 +84,7 @@ class Target(NamedTuple):
     panels: Panels
     entries: Entries
     tensor: Tensor
+    rows: Rows
     integrals: FloatArray
 
 
@@ -97,7 +116,8 @@ class Source(NamedTuple):
 
 
 TENSOR = types.NamedTuple([INTEGERS, INTEGERS, FLOATS, INTEGERS, INTEGERS, INTEGERS], Tensor)
-TARGET = types.NamedTuple([PANELS, ENTRIES, TENSOR, FLOATS], Target)
+ROWS = types.NamedUniTuple(INTEGERS, len(Rows._fields), Rows)
+TARGET = types.NamedTuple([PANELS, ENTRIES, TENSOR, ROWS, FLOATS], Target)
 SOURCE = types.NamedTuple([INTEGERS, FLOATS, INTEGERS, INTEGERS, FLOATS, FLOATS, FLOATS], Source)
 
 
@@ -209,8 +229,17 @@ def _plan(basis: Basis) -> Plan:
     symbolic = analyse(sparse.csr_array(pattern + pattern.T))
     grouped = _grouped(tensor, symbolic)
     integrals = _even(basis.integrals[symbolic.order][None, :])
-    entries = _entries(symbolic, grouped.row[: tensor.rows.size], grouped.column[: tensor.rows.size])
-    return Plan(symbolic, Target(symbolic.panels, entries, grouped, integrals))
+    rows, columns = grouped.row[: tensor.rows.size], grouped.column[: tensor.rows.size]
+    start, entry = _near(rows, columns, symbolic.order.size)
+    row = np.repeat(np.arange(symbolic.order.size), np.diff(start))
+    target = Target(
+        panels=symbolic.panels,
+        entries=_entries(symbolic, rows, columns),
+        tensor=grouped,
+        rows=Rows(start, entry, rows[entry] + columns[entry] - row),
+        integrals=integrals,
+    )
+    return Plan(symbolic, target)
 
 
 def _even(columns: FloatArray) -> FloatArray:
@@ -233,9 +262,9 @@ def _grouped(tensor: TargetTensor, symbolic: Symbolic) -> Tensor:
         columns,
         *_near(rows, columns, n),
     )
-    # Groups in the order of their first column, so that what panels read one after the other lies together.
+    # Groups in the order of their first cell, so that what panels read one after the other lies together.
     whole = chosen[: chosen.size // GROUP * GROUP].reshape(-1, GROUP)
-    sort = np.argsort(columns[whole].min(axis=1), kind="stable")
+    sort = np.argsort(symbolic.cells(rows, columns)[whole].min(axis=1), kind="stable")
     chosen = np.concatenate([whole[sort].ravel(), chosen[whole.size :]])
 
     padding = -chosen.size % GROUP

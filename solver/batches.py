@@ -12,14 +12,27 @@ import numpy as np
 
 from solver.assembly import SOURCE, TARGET, Systems
 from solver.cholesky import FACTOR, FLOATS, INTEGERS, Factor, kernel, solve_lanes, types
-from solver.forms import DENSITY, HEAVIEST, RESIDUAL, assemble, measure, pair_products, quadratic_forms
+from solver.forms import (
+    DENSITY,
+    FIRST,
+    HEAVIEST,
+    RESIDUAL,
+    SECOND,
+    SUMMARY,
+    assemble,
+    measure,
+    pair_products,
+    quadratic_forms,
+)
 from solver.lanes import (
     LANES,
     add,
     add_product,
     divide,
     empty_lanes,
+    item,
     load,
+    load_splat,
     multiply,
     splat,
     store,
@@ -50,12 +63,10 @@ class Work(NamedTuple):
         b and q likewise, the two directions side by side.
     diagonal : (n, LANES)
         Diagonal of A, doubled where a face is grounded.
-    rest : (3n, LANES)
-        Aq − b in both directions, and sums of the rows of |A|.
     weights : (GROUPS · 3 m, LANES)
         mean_f(β₀ᵢ), g_f1[i], g_f2[i] of each of at most m source functions that live on a group's faces.
-    summary : (GROUPS · 3, LANES)
-        Heaviest function, energy density, residual.
+    summary : (GROUPS · SUMMARY, LANES)
+        What is known of each group's faces, as `solver.forms` lists it.
     """
 
     matrix: FloatArray
@@ -65,7 +76,6 @@ class Work(NamedTuple):
     right: FloatArray
     x: FloatArray
     diagonal: FloatArray
-    rest: FloatArray
     weights: FloatArray
     summary: FloatArray
 
@@ -151,9 +161,8 @@ def bench(systems: Systems) -> Bench:
             right=empty_lanes(GROUPS * 2 * n),
             x=empty_lanes(GROUPS * 2 * n),
             diagonal=empty_lanes(n),
-            rest=empty_lanes(3 * n),
             weights=empty_lanes(GROUPS * 3 * active),
-            summary=empty_lanes(GROUPS * 3),
+            summary=empty_lanes(GROUPS * SUMMARY),
         ),
         Factor(empty_lanes(int(target.panels.start[-1])), empty_lanes(n), empty_lanes(2)),
         Slots(
@@ -202,22 +211,23 @@ def _gather(source, faces, first, weights, slot, active):  # type: ignore[no-unt
 
 @kernel(types.void(SOURCE, FLOATS, types.float64, INTEGERS, FLOATS, WORK, types.int64))
 def _mix(source, integrals, regularisation, active, weights, work, group):  # type: ignore[no-untyped-def]
-    """c̃ = (1−ε) Cᵀ mean(β₀) + ε ∫β, u = (1−ε) (CU)ᵀ mean(β₀) + ε ∫β, b_s = (1−ε) (CU)ᵀ g_s, argmax c."""
+    """c̃ = (1−ε) Cᵀ mean(β₀) + ε ∫β and argmax c, u = (1−ε) (CU)ᵀ mean(β₀) + ε ∫β, b_s = (1−ε) (CU)ᵀ g_s."""
     n = integrals.shape[1]
     keep = splat(1 - regularisation)
     heaviest, most = splat(0.0), splat(-1.0)
+    total, first, second = splat(0.0), splat(0.0), splat(0.0)
     for j in range(0, n, 2):
         c, u, b0, b1 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
         d, v, e0, e1 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
         for k in range(active.size):
             mean, slope, slope1 = load(weights, 3 * k), load(weights, 3 * k + 1), load(weights, 3 * k + 2)
-            row = source.coefficients[active[k]]
-            c, d = add_product(splat(row[j]), mean, c), add_product(splat(row[j + 1]), mean, d)
-            row = source.received[active[k]]
-            weight = splat(row[j])
+            at = item(active, k) * n + j
+            c = add_product(load_splat(source.coefficients, at), mean, c)
+            d = add_product(load_splat(source.coefficients, at + 1), mean, d)
+            weight = load_splat(source.received, at)
             u = add_product(weight, mean, u)
             b0, b1 = add_product(weight, slope, b0), add_product(weight, slope1, b1)
-            weight = splat(row[j + 1])
+            weight = load_splat(source.received, at + 1)
             v = add_product(weight, mean, v)
             e0, e1 = add_product(weight, slope, e0), add_product(weight, slope1, e1)
         heaviest = where_above(c, most, splat(float(j)), heaviest)
@@ -225,32 +235,36 @@ def _mix(source, integrals, regularisation, active, weights, work, group):  # ty
         heaviest = where_above(d, most, splat(float(j + 1)), heaviest)
         most = where_above(d, most, d, most)
         row = group * n + j
-        spread = splat(regularisation * integrals[0, j])
+        spread = multiply(splat(regularisation), load_splat(integrals, j))
+        u, b0, b1 = add_product(keep, u, spread), multiply(keep, b0), multiply(keep, b1)
         store(work.blended, GROUPS * j + group, add_product(keep, c, spread))
-        store(work.means, row, add_product(keep, u, spread))
-        store(work.right, 2 * row, multiply(keep, b0))
-        store(work.right, 2 * row + 1, multiply(keep, b1))
-        spread = splat(regularisation * integrals[0, j + 1])
+        store(work.means, row, u)
+        store(work.right, 2 * row, b0)
+        store(work.right, 2 * row + 1, b1)
+        spread = multiply(splat(regularisation), load_splat(integrals, j + 1))
+        v, e0, e1 = add_product(keep, v, spread), multiply(keep, e0), multiply(keep, e1)
         store(work.blended, GROUPS * (j + 1) + group, add_product(keep, d, spread))
-        store(work.means, row + 1, add_product(keep, v, spread))
-        store(work.right, 2 * row + 2, multiply(keep, e0))
-        store(work.right, 2 * row + 3, multiply(keep, e1))
-    store(work.summary, 3 * group + HEAVIEST, heaviest)
+        store(work.means, row + 1, v)
+        store(work.right, 2 * row + 2, e0)
+        store(work.right, 2 * row + 3, e1)
+        total, first, second = add(add(total, u), v), add(add(first, b0), e0), add(add(second, b1), e1)
+    store(work.summary, SUMMARY * group + HEAVIEST, heaviest)
+    store(work.summary, SUMMARY * group + FIRST, divide(first, total))
+    store(work.summary, SUMMARY * group + SECOND, divide(second, total))
 
 
-@kernel(types.void(FLOATS, FLOATS))
-def _project(means, right):  # type: ignore[no-untyped-def]
-    """Make constants orthogonal to b: b ← b − (1ᵀb) u / (1ᵀu)."""
-    total, first, second = splat(0.0), splat(0.0), splat(0.0)
-    for k in range(len(means)):
-        total = add(total, load(means, k))
-        first = add(first, load(right, 2 * k))
-        second = add(second, load(right, 2 * k + 1))
-    first, second = divide(first, total), divide(second, total)
+@kernel(types.void(FLOATS, FLOATS, FLOATS, FLOATS))
+def _project(summary, means, right, x):  # type: ignore[no-untyped-def]
+    """Make constants orthogonal to b, b ← b − (1ᵀb) u / (1ᵀu), and put it where q will be."""
+    first, second = load(summary, FIRST), load(summary, SECOND)
     for k in range(len(means)):
         u = load(means, k)
-        store(right, 2 * k, subtract_product(u, first, load(right, 2 * k)))
-        store(right, 2 * k + 1, subtract_product(u, second, load(right, 2 * k + 1)))
+        b0 = subtract_product(u, first, load(right, 2 * k))
+        b1 = subtract_product(u, second, load(right, 2 * k + 1))
+        store(right, 2 * k, b0)
+        store(right, 2 * k + 1, b1)
+        store(x, 2 * k, b0)
+        store(x, 2 * k + 1, b1)
 
 
 @kernel(types.void(FLOATS, FLOATS, INTEGERS, FLOATS))
@@ -354,14 +368,12 @@ def solve_faces(  # type: ignore[no-untyped-def]
             means = work.means[group * n : (group + 1) * n]
             right = work.right[group * 2 * n : (group + 1) * 2 * n]
             x = work.x[group * 2 * n : (group + 1) * 2 * n]
-            summary = work.summary[3 * group : 3 * group + 3]
+            summary = work.summary[SUMMARY * group : SUMMARY * (group + 1)]
             _ground(summary, matrix, target.tensor.diagonal, work.diagonal)
-            _project(means, right)
-            for row in range(len(x)):
-                store(x, row, load(right, row))
+            _project(summary, means, right, x)
             solve_lanes(target.panels, target.entries, matrix, work.diagonal, factor, x)
             _shift(means, x)
-            measure(target.tensor, matrix, right, x, work.rest, summary)
+            measure(target.rows, matrix, right, x, summary)
             _report(summary, factor.failed, work.diagonal, first, count, results)
             if gradient.line.size > 0:
                 pair_products(target.tensor, x, matrix)

@@ -14,9 +14,13 @@ import numba
 from numba.core import types as numba_types
 
 from solver.lanes import (
+    STRIP,
+    STRIP_ROWS,
     TILE_COLUMNS,
     TILE_ROWS,
     divide,
+    finish_strip,
+    item,
     load,
     multiply,
     splat,
@@ -112,30 +116,6 @@ def _update(values, places, begin, lines, columns, stride, depth, place, target,
             )  # fmt: skip
 
 
-@kernel(types.void(FLOATS, FLOATS, *[types.int64] * 4))
-def _substitute_four(values, inverse, column, begin, lines, width):  # type: ignore[no-untyped-def]
-    """Lines below a 4 × 4 triangle L: x Lᵀ = line, with L in registers."""
-    s0, s1, s2, s3 = (
-        load(inverse, column), load(inverse, column + 1), load(inverse, column + 2), load(inverse, column + 3)
-    )  # fmt: skip
-    l10 = load(values, begin + width)
-    l20, l21 = load(values, begin + 2 * width), load(values, begin + 2 * width + 1)
-    l30, l31 = load(values, begin + 3 * width), load(values, begin + 3 * width + 1)
-    l32 = load(values, begin + 3 * width + 2)
-    for i in range(4, lines):
-        line = begin + i * width
-        x0 = multiply(load(values, line), s0)
-        x1 = multiply(subtract_product(x0, l10, load(values, line + 1)), s1)
-        x2 = subtract_product(x0, l20, load(values, line + 2))
-        x2 = multiply(subtract_product(x1, l21, x2), s2)
-        x3 = subtract_product(x0, l30, load(values, line + 3))
-        x3 = multiply(subtract_product(x2, l32, subtract_product(x1, l31, x3)), s3)
-        store(values, line, x0)
-        store(values, line + 1, x1)
-        store(values, line + 2, x2)
-        store(values, line + 3, x3)
-
-
 @kernel(types.void(FACTOR, FLOATS, *[types.int64] * 5))
 def _factor_columns(factor, diagonal, column, begin, lines, width, count):  # type: ignore[no-untyped-def]
     """Factor `count` columns that earlier ones no longer touch: pivots, then the lines below."""
@@ -159,9 +139,6 @@ def _factor_columns(factor, diagonal, column, begin, lines, width, count):  # ty
                     load(values, begin + i * width + k), load(values, begin + j * width + k), entry
                 )
             store(values, begin + i * width + j, multiply(entry, scale))
-    if count == 4:
-        _substitute_four(values, inverse, column, begin, lines, width)
-        return
     for i in range(count, lines):
         line = begin + i * width
         for j in range(count):
@@ -177,10 +154,13 @@ def _factor_panel(panels, entries, matrix, diagonal, factor, panel):  # type: ig
     values = factor.values
     start, width, column = panels.start[panel], panels.width[panel], panels.first[panel]
     lines = panels.row_start[panel + 1] - panels.row_start[panel]
-    for cell in range(start, panels.start[panel + 1]):
+    for i in range(width):
+        for cell in range(start + i * width, start + i * width + i + 1):
+            store(values, cell, splat(0.0))
+    for cell in range(start + width * width, panels.start[panel + 1]):
         store(values, cell, splat(0.0))
     for k in range(entries.start[panel], entries.start[panel + 1]):
-        store(values, entries.cell[k], load(matrix, entries.entry[k]))
+        store(values, item(entries.cell, k), load(matrix, item(entries.entry, k)))
     for k in range(width):
         store(values, start + k * width + k, load(diagonal, column + k))
     for u in range(panels.update_start[panel], panels.update_start[panel + 1]):
@@ -189,12 +169,19 @@ def _factor_panel(panels, entries, matrix, diagonal, factor, panel):  # type: ig
         below = panels.row_start[other + 1] - panels.row_start[other] - a
         begin = panels.start[other] + a * depth
         _update(values, panels.places, begin, below, b - a, depth, depth, place, start, width)
-    for k in range(0, width, 4):
-        count = min(4, width - k)
+    for k in range(0, width, STRIP):
+        count = min(STRIP, width - k)
         begin = start + k * width
+        whole = count == STRIP
+        # A whole strip's lines below the triangle are updated and substituted while they are in registers.
+        own = count if whole else lines - k
         if k > 0:
-            _update(values, panels.places, begin, lines - k, count, width, k, k, start, width)
-        _factor_columns(factor, diagonal, column + k, begin + k, lines - k, width, count)
+            _update(values, panels.places, begin, own, count, width, k, k, start, width)
+        _factor_columns(factor, diagonal, column + k, begin + k, own, width, count)
+        if whole:
+            for i in range(k + STRIP, lines, STRIP_ROWS):
+                rows = min(STRIP_ROWS, lines - i)
+                finish_strip(values, factor.inverse, column + k, begin, start + i * width, width, k, rows)
 
 
 @kernel(types.void(PANELS, FACTOR, types.int64, FLOATS))
@@ -202,7 +189,8 @@ def _forwards(panels, factor, panel, x):  # type: ignore[no-untyped-def]
     """One panel of L y = b: its own columns, then what they take from the lines below, four at a time."""
     values, start, width = factor.values, panels.start[panel], panels.width[panel]
     own = 2 * panels.first[panel]
-    rows = panels.rows[panels.row_start[panel] : panels.row_start[panel + 1]]
+    rows, first = panels.rows, panels.row_start[panel]
+    lines = panels.row_start[panel + 1] - first
     for i in range(width):
         x0, x1 = load(x, own + 2 * i), load(x, own + 2 * i + 1)
         for k in range(i):
@@ -212,9 +200,12 @@ def _forwards(panels, factor, panel, x):  # type: ignore[no-untyped-def]
         scale = load(factor.inverse, panels.first[panel] + i)
         store(x, own + 2 * i, multiply(x0, scale))
         store(x, own + 2 * i + 1, multiply(x1, scale))
-    whole = width + (rows.size - width) // 4 * 4
+    whole = width + (lines - width) // 4 * 4
     for i in range(width, whole, 4):
-        a, b, c, d = 2 * rows[i], 2 * rows[i + 1], 2 * rows[i + 2], 2 * rows[i + 3]
+        at = first + i
+        a, b, c, d = (
+            2 * item(rows, at), 2 * item(rows, at + 1), 2 * item(rows, at + 2), 2 * item(rows, at + 3)
+        )  # fmt: skip
         a0, a1, b0, b1 = load(x, a), load(x, a + 1), load(x, b), load(x, b + 1)
         c0, c1, d0, d1 = load(x, c), load(x, c + 1), load(x, d), load(x, d + 1)
         line = start + i * width
@@ -236,14 +227,14 @@ def _forwards(panels, factor, panel, x):  # type: ignore[no-untyped-def]
         store(x, c + 1, c1)
         store(x, d, d0)
         store(x, d + 1, d1)
-    for i in range(whole, rows.size):
-        x0, x1 = load(x, 2 * rows[i]), load(x, 2 * rows[i] + 1)
+    for i in range(whole, lines):
+        x0, x1 = load(x, 2 * item(rows, first + i)), load(x, 2 * item(rows, first + i) + 1)
         for k in range(width):
             entry = load(values, start + i * width + k)
             x0 = subtract_product(entry, load(x, own + 2 * k), x0)
             x1 = subtract_product(entry, load(x, own + 2 * k + 1), x1)
-        store(x, 2 * rows[i], x0)
-        store(x, 2 * rows[i] + 1, x1)
+        store(x, 2 * item(rows, first + i), x0)
+        store(x, 2 * item(rows, first + i) + 1, x1)
 
 
 @kernel(types.void(PANELS, FACTOR, types.int64, FLOATS))
@@ -251,14 +242,15 @@ def _backwards(panels, factor, panel, x):  # type: ignore[no-untyped-def]
     """One panel of Lᵀ x = y: what the lines below take from its columns, four at a time, then the columns."""
     values, start, width = factor.values, panels.start[panel], panels.width[panel]
     own = 2 * panels.first[panel]
-    rows = panels.rows[panels.row_start[panel] : panels.row_start[panel + 1]]
+    rows, first = panels.rows, panels.row_start[panel]
+    lines = panels.row_start[panel + 1] - first
     whole = width // 4 * 4
     for k in range(0, whole, 4):
         column = own + 2 * k
         a0, a1, b0, b1 = load(x, column), load(x, column + 1), load(x, column + 2), load(x, column + 3)
         c0, c1, d0, d1 = load(x, column + 4), load(x, column + 5), load(x, column + 6), load(x, column + 7)
-        for i in range(width, rows.size):
-            x0, x1 = load(x, 2 * rows[i]), load(x, 2 * rows[i] + 1)
+        for i in range(width, lines):
+            x0, x1 = load(x, 2 * item(rows, first + i)), load(x, 2 * item(rows, first + i) + 1)
             line = start + i * width + k
             entry = load(values, line)
             a0, a1 = subtract_product(entry, x0, a0), subtract_product(entry, x1, a1)
@@ -278,10 +270,10 @@ def _backwards(panels, factor, panel, x):  # type: ignore[no-untyped-def]
         store(x, column + 7, d1)
     for k in range(whole, width):
         x0, x1 = load(x, own + 2 * k), load(x, own + 2 * k + 1)
-        for i in range(width, rows.size):
+        for i in range(width, lines):
             entry = load(values, start + i * width + k)
-            x0 = subtract_product(entry, load(x, 2 * rows[i]), x0)
-            x1 = subtract_product(entry, load(x, 2 * rows[i] + 1), x1)
+            x0 = subtract_product(entry, load(x, 2 * item(rows, first + i)), x0)
+            x1 = subtract_product(entry, load(x, 2 * item(rows, first + i) + 1), x1)
         store(x, own + 2 * k, x0)
         store(x, own + 2 * k + 1, x1)
     for i in range(width - 1, -1, -1):

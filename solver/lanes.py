@@ -29,6 +29,9 @@ _WIDE = "+avx512f" in cpu_target.target_context.codegen().magic_tuple()[2]
 LANES = 8 if _WIDE else 4
 #: Rows and columns of a tile whose sums stay in registers: 24 of the 32 that AVX-512 has, 8 of 16 elsewhere.
 TILE_ROWS, TILE_COLUMNS = (6, 4) if _WIDE else (4, 2)
+#: Columns that are factored at once, and rows of a tile of that width.
+STRIP = 4
+STRIP_ROWS = 6 if _WIDE else 2
 
 _VECTOR = ir.VectorType(ir.DoubleType(), LANES)
 _INT64 = ir.IntType(64)
@@ -155,6 +158,28 @@ def store_four(_: Any, array: Any, index: Any, a: Any, b: Any, c: Any, d: Any) -
 
 
 @intrinsic
+def item(_: Any, array: Any, index: Any) -> Any:
+    """Item `index` ≥ 0 of an array of integers, without Python's rule for negative ones."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        numbers = context.make_array(signature.args[0])(context, builder, args[0]).data
+        return builder.load(_row(builder, numbers, args[1]))
+
+    return types.int64(array, types.int64), emit
+
+
+@intrinsic
+def load_splat(_: Any, array: Any, index: Any) -> Any:
+    """Number `index` of a C-contiguous array, counted through its rows, in every lane."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        numbers = context.make_array(signature.args[0])(context, builder, args[0]).data
+        return _splat(builder, builder.load(_row(builder, numbers, args[1])))
+
+    return lanes(array, types.int64), emit
+
+
+@intrinsic
 def splat(_: Any, scalar: Any) -> Any:
     """One number in every lane."""
 
@@ -208,23 +233,22 @@ def where_above(_: Any, a: Any, limit: Any, then: Any, otherwise: Any) -> Any:
     return lanes(lanes, lanes, lanes, lanes), emit
 
 
-def _emit_tile(builder: Any, base: Any, place: Any, shape: tuple[int, int], numbers: list[Any]) -> None:
-    """Emit one tile of fixed size: a loop over its terms with sums in registers, then the subtractions."""
-    rows, columns = shape
-    a, b, stride, depth, i, j, target, width = numbers
+def _lines(builder: Any, base: Any, start: Any, count: int, stride: Any) -> list[Any]:
+    """Pointers to the first rows of `count` lines."""
+    starts = [builder.add(start, builder.mul(_INT64(k), stride)) for k in range(count)]
+    return [_row(builder, base, begin) for begin in starts]
 
-    def lines(start: Any, count: int) -> list[Any]:
-        starts = [builder.add(start, builder.mul(_INT64(k), stride)) for k in range(count)]
-        return [_row(builder, base, begin) for begin in starts]
 
-    a_lines, b_lines = lines(a, rows), lines(b, columns)
+def _emit_sums(builder: Any, a_lines: list[Any], b_lines: list[Any], depth: Any) -> list[Any]:
+    """Emit Σ_k A[i, k] B[j, k] of a tile of fixed size, a loop over its terms with sums in registers."""
+    zero = ir.Constant(_VECTOR, [0.0] * LANES)
     before = builder.block
     loop, after = builder.append_basic_block("terms"), builder.append_basic_block("write")
-    builder.branch(loop)
+    builder.cbranch(builder.icmp_signed(">", depth, _INT64(0)), loop, after)
 
     builder.position_at_end(loop)
     term = builder.phi(_INT64)
-    sums = [builder.phi(_VECTOR) for _ in range(rows * columns)]
+    sums = [builder.phi(_VECTOR) for _ in range(len(a_lines) * len(b_lines))]
     b_terms = [builder.load(_row(builder, line, term), align=8) for line in b_lines]
     fused: list[Any] = []
     for line in a_lines:
@@ -235,17 +259,30 @@ def _emit_tile(builder: Any, base: Any, place: Any, shape: tuple[int, int], numb
     term.add_incoming(_INT64(0), before)
     term.add_incoming(following, loop)
     for start, end in zip(sums, fused, strict=True):
-        start.add_incoming(ir.Constant(_VECTOR, [0.0] * LANES), before)
+        start.add_incoming(zero, before)
         start.add_incoming(end, loop)
 
     builder.position_at_end(after)
+    total = [builder.phi(_VECTOR) for _ in sums]
+    for found, end in zip(total, fused, strict=True):
+        found.add_incoming(zero, before)
+        found.add_incoming(end, loop)
+    return total
+
+
+def _emit_tile(builder: Any, base: Any, place: Any, shape: tuple[int, int], numbers: list[Any]) -> None:
+    """Emit one tile of fixed size: its sums, then the subtractions."""
+    rows, columns = shape
+    a, b, stride, depth, i, j, target, width = numbers
+    a_lines, b_lines = _lines(builder, base, a, rows, stride), _lines(builder, base, b, columns, stride)
+    sums = _emit_sums(builder, a_lines, b_lines, depth)
     column = [builder.load(builder.gep(place, [builder.add(j, _INT64(k))])) for k in range(columns)]
     for k in range(rows):
         row = builder.load(builder.gep(place, [builder.add(i, _INT64(k))]))
         line = _row(builder, base, builder.add(target, builder.mul(row, width)))
         for m in range(columns):
             cell = _row(builder, line, column[m])
-            builder.store(builder.fsub(builder.load(cell, align=8), fused[k * columns + m]), cell, align=8)
+            builder.store(builder.fsub(builder.load(cell, align=8), sums[k * columns + m]), cell, align=8)
 
 
 @intrinsic
@@ -277,3 +314,52 @@ def update_tile(
         return context.get_dummy_value()
 
     return types.void(values, places, *[types.int64] * 10), emit
+
+
+def _emit_strip(builder: Any, base: Any, inverse: Any, rows: int, numbers: list[Any]) -> None:
+    """Emit some lines of a strip: sums over the columns before it, then x Lᵀ = line in registers."""
+    first, line, width, depth = numbers
+    triangle = _lines(builder, base, first, STRIP, width)
+    lines = _lines(builder, base, line, rows, width)
+    sums = _emit_sums(builder, lines, triangle, depth)
+    for k, start in enumerate(lines):
+        own = _row(builder, start, depth)
+        x: list[Any] = []
+        for j in range(STRIP):
+            cell = builder.load(_row(builder, own, _INT64(j)), align=8)
+            value = builder.fsub(cell, sums[k * STRIP + j])
+            for m, earlier in enumerate(x):
+                entry = builder.load(_row(builder, triangle[j], builder.add(depth, _INT64(m))), align=8)
+                value = _fused(builder, builder.fneg(earlier), entry, value)
+            scale = builder.load(_row(builder, inverse, _INT64(j)), align=8)
+            x.append(builder.fmul(value, scale))
+        for j in range(STRIP):
+            builder.store(x[j], _row(builder, own, _INT64(j)), align=8)
+
+
+@intrinsic
+def finish_strip(
+    _: Any, values: Any, inverse: Any, column: Any, first: Any, line: Any, width: Any, depth: Any, rows: Any
+) -> Any:
+    """X ← (X − A Bᵀ) L⁻ᵀ for at most STRIP_ROWS lines of a panel and STRIP of its columns.
+
+    The panel has lines of `width`. X stands `depth` places into its lines from row `line` of `values` on, A
+    before it. B and then L, whose factorisation is finished, stand likewise in STRIP lines from `first` on;
+    1 / L_kk are the rows of `inverse` from `column` on.
+    """
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        base = _rows(context, builder, signature.args[0], args[0])
+        scales = _row(builder, _rows(context, builder, signature.args[1], args[1]), args[2])
+        end = builder.append_basic_block("end")
+        choose = builder.switch(args[7], end)
+        for count in range(1, STRIP_ROWS + 1):
+            block = builder.append_basic_block(f"strip_{count}")
+            choose.add_case(_INT64(count), block)
+            builder.position_at_end(block)
+            _emit_strip(builder, base, scales, count, list(args[3:7]))
+            builder.branch(end)
+        builder.position_at_end(end)
+        return context.get_dummy_value()
+
+    return types.void(values, inverse, *[types.int64] * 6), emit

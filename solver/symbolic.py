@@ -16,9 +16,9 @@ from scipy.sparse import linalg
 
 from solver.mesh import IntArray
 
-#: Share of a panel that may be zeros when supernodes are merged: fewer, wider panels are worth some idle
-#: arithmetic.
-PADDING = 0.05
+#: Share of a panel that may be zeros when supernodes are merged, in panels of up to ``NARROW`` columns and in
+#: wider ones: every update reads and writes its target, so that few updates are worth some idle arithmetic.
+NARROW, NARROW_PADDING, PADDING = 8, 0.3, 0.1
 #: Widest panel: what a panel is updated by should stay in the first cache.
 WIDEST = 32
 
@@ -169,7 +169,7 @@ def _supernodes(structure: list[IntArray], parent: IntArray) -> list[tuple[int, 
         while found and first <= parent[panel[0] - 1] < stop:
             begin, _, rows = found[-1]
             merged = (begin, stop, np.union1d(rows, np.concatenate([np.arange(begin, stop), panel[2]])))
-            if padding(*merged) > PADDING:
+            if padding(*merged) > (NARROW_PADDING if stop - begin <= NARROW else PADDING):
                 break
             found.pop()
             panel = merged
