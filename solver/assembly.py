@@ -157,7 +157,28 @@ class Systems:
     widest: int
 
 
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """What all soft maps from one source basis share; made once for each basis.
+
+    Attributes
+    ----------
+    corner, slope, start, function, value
+        As in `Source`.
+    widest : int
+        Bound on the functions that live on a face.
+    """
+
+    corner: IntArray
+    slope: FloatArray
+    start: IntArray
+    function: IntArray
+    value: FloatArray
+    widest: int
+
+
 _plans: weakref.WeakKeyDictionary[Basis, Plan] = weakref.WeakKeyDictionary()
+_layouts: weakref.WeakKeyDictionary[Basis, Layout] = weakref.WeakKeyDictionary()
 
 
 def systems(softmap: SoftMap, regularisation: float) -> Systems:
@@ -183,20 +204,33 @@ def systems(softmap: SoftMap, regularisation: float) -> Systems:
     if not 0 < regularisation < 1:
         message = f"the regularisation must be strictly between 0 and 1, not {regularisation}"
         raise SolverError(message, value=float(regularisation))
-    plan = plan_of(softmap.target)
+    plan, layout = plan_of(softmap.target), _layout_of(softmap.source)
     order = plan.symbolic.order
-    mesh, functions = softmap.source.mesh, softmap.source.functions
     source = Source(
-        corner=mesh.faces.ravel().astype(np.int64),
-        slope=np.einsum("fcx,fsx->fcs", hat_gradients(mesh), mesh.frames).reshape(-1, 2),
-        start=functions.indptr.astype(np.int64),
-        function=functions.indices.astype(np.int64),
-        value=np.array(functions.data, dtype=np.float64, ndmin=2),
+        corner=layout.corner,
+        slope=layout.slope,
+        start=layout.start,
+        function=layout.function,
+        value=layout.value,
         coefficients=_even(softmap.coefficients[:, order]),
         received=_even((softmap.coefficients @ softmap.target.overlap)[:, order]),
     )
-    widest = int(np.diff(functions.indptr)[mesh.faces].sum(axis=1).max())
-    return Systems(softmap, float(regularisation), plan, source, widest)
+    return Systems(softmap, float(regularisation), plan, source, layout.widest)
+
+
+def _layout_of(basis: Basis) -> Layout:
+    layout = _layouts.get(basis)
+    if layout is None:
+        mesh, functions = basis.mesh, basis.functions
+        layout = _layouts[basis] = Layout(
+            corner=mesh.faces.ravel().astype(np.int64),
+            slope=(hat_gradients(mesh) @ mesh.frames.transpose(0, 2, 1)).reshape(-1, 2),
+            start=functions.indptr.astype(np.int64),
+            function=functions.indices.astype(np.int64),
+            value=np.array(functions.data, dtype=np.float64, ndmin=2),
+            widest=int(np.diff(functions.indptr)[mesh.faces].sum(axis=1).max()),
+        )
+    return layout
 
 
 def plan_of(basis: Basis) -> Plan:

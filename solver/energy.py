@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from solver.assembly import systems
+from solver.assembly import Systems, systems
 from solver.chunks import solved_chunks
 from solver.errors import SolverError
-from solver.mesh import FloatArray
+from solver.mesh import FloatArray, IntArray
 from solver.potential import FACE_BLOCK
 from solver.softmap import SoftMap
 
@@ -90,11 +90,12 @@ def dirichlet(
         If a face's system has no trustworthy solution; names the face.
     """
     n_faces = softmap.source.mesh.n_faces
+    solved = systems(softmap, regularisation)
 
     def part(start: int) -> Dirichlet:
         stop = min(start + FACE_BLOCK, n_faces)
         done = None if progress is None else lambda x: progress((start + x * (stop - start)) / n_faces)
-        return dirichlet_block(softmap, start, stop, regularisation, gradient, threads, done)
+        return _block(solved, np.arange(start, stop), gradient, threads, done)
 
     return gather_dirichlet(part(start) for start in range(0, n_faces, FACE_BLOCK))
 
@@ -132,11 +133,21 @@ def dirichlet_block(
     n_faces = softmap.source.mesh.n_faces
     if not 0 <= start < stop <= n_faces:
         raise SolverError(f"[{start}, {stop}) is no block of the faces 0 … {n_faces - 1}")
-    density = np.empty(stop - start)
+    return _block(systems(softmap, regularisation), np.arange(start, stop), gradient, threads, progress)
+
+
+def _block(
+    solved: Systems,
+    faces: IntArray,
+    gradient: bool,
+    threads: int | None,
+    progress: Callable[[float], None] | None,
+) -> Dirichlet:
+    softmap, regularisation = solved.softmap, solved.regularisation
+    density = np.empty(faces.size)
     slopes, forms = np.zeros((2, softmap.source.size if gradient else 0, softmap.target.size))
     residual, done = 0.0, 0
-    solved = systems(softmap, regularisation)
-    for chunk in solved_chunks(solved, np.arange(start, stop), gradient=gradient, threads=threads):
+    for chunk in solved_chunks(solved, faces, gradient=gradient, threads=threads):
         density[done : done + chunk.faces.size] = chunk.density
         done += chunk.faces.size
         residual = max(residual, chunk.residual)
@@ -144,7 +155,7 @@ def dirichlet_block(
         forms[chunk.functions] += chunk.forms
         if progress is not None:
             progress(done / density.size)
-    energy = math.fsum(softmap.source.mesh.face_areas[start:stop] * density)
+    energy = math.fsum(softmap.source.mesh.face_areas[faces] * density)
     # Prop. 7: D = (1−ε) [ 2 Σ_fs area₀ g_fs (U q_fs)ᵀ − Σ_f area₀ mean_f(β₀) (Σ_s q_fsᵀ Wⱼ q_fs)ⱼ ].
     descent = (1 - regularisation) * (2 * (softmap.target.overlap @ slopes.T).T - forms) if gradient else None
     return Dirichlet(energy, density, descent, residual)
