@@ -10,10 +10,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.linalg
-from scipy import sparse
-from scipy.sparse import linalg as sparse_linalg
 
+from solver.eigenpairs import smallest_eigenpairs
 from solver.errors import InvalidDescriptor
 from solver.fem import mass, stiffness
 from solver.mesh import FloatArray, Mesh
@@ -22,10 +20,6 @@ from solver.mesh import FloatArray, Mesh
 ZERO_EIGENVALUE = 1e-8
 #: Below 28 energies the range log λ₂ + 2σ … log λ_max − 2σ with σ = 7(e_max − e_min)/count runs backwards.
 FEWEST_ENERGIES = 28
-#: Up to this many vertices a dense eigensolver is quicker than Lanczos.
-DENSE_VERTICES = 600
-#: Shift of the Laplacian in units of 1/area: far below λ₂ of any mesh, far above rounding.
-SHIFT = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +49,7 @@ class Spectrum:
         return int(positive[0])
 
 
-def spectrum(mesh: Mesh, eigenpairs: int = 200) -> Spectrum:
+def spectrum(mesh: Mesh, eigenpairs: int = 200, threads: int | None = None) -> Spectrum:
     """Smallest eigenpairs K φ = λ M φ of the cotangent Laplacian with lumped mass, on the unit-area mesh.
 
     Parameters
@@ -63,6 +57,8 @@ def spectrum(mesh: Mesh, eigenpairs: int = 200) -> Spectrum:
     mesh : Mesh
     eigenpairs : int
         How many; at most as many as there are referenced vertices.
+    threads : int, optional
+        Threads that share the work, one by default. The result does not depend on it.
 
     Returns
     -------
@@ -79,47 +75,10 @@ def spectrum(mesh: Mesh, eigenpairs: int = 200) -> Spectrum:
     weights = mass(mesh)[vertices]
     laplacian = stiffness(mesh)[vertices][:, vertices]
     count = min(eigenpairs, len(vertices))
-    if len(vertices) <= DENSE_VERTICES or count > len(vertices) // 2:
-        values, functions = _dense_eigenpairs(laplacian, weights, count)
-    else:
-        values, functions = _sparse_eigenpairs(laplacian, weights, count)
+    values, functions = smallest_eigenpairs(laplacian, weights, count, threads)
     whole = np.zeros((mesh.n_vertices, count))
     whole[vertices] = functions
     return Spectrum(np.maximum(values, 0.0), whole)
-
-
-def _dense_eigenpairs(
-    laplacian: sparse.csr_array, weights: FloatArray, count: int
-) -> tuple[FloatArray, FloatArray]:
-    root = np.sqrt(weights)
-    symmetric = laplacian.toarray() / np.outer(root, root)
-    values, functions = scipy.linalg.eigh(symmetric, subset_by_index=(0, count - 1))
-    return values, functions / root[:, None]
-
-
-def _sparse_eigenpairs(
-    laplacian: sparse.csr_array, weights: FloatArray, count: int
-) -> tuple[FloatArray, FloatArray]:
-    # Lanczos on M^½ (K + sM)⁻¹ M^½, whose largest eigenvalues 1/(λ + s) belong to the smallest λ.
-    n = len(weights)
-    root = np.sqrt(weights)
-    shifted = (laplacian + sparse.diags_array(SHIFT * weights)).tocsc()
-    factor = sparse_linalg.splu(
-        shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-    )
-    inverse = sparse_linalg.LinearOperator(
-        (n, n), matvec=lambda x: root * factor.solve(root * x.ravel()), dtype=np.float64
-    )
-    # A fixed start makes the answer repeatable, and a random one has a part in every eigenspace.
-    start = np.random.default_rng(0).standard_normal(n)
-    try:
-        inverted, functions = sparse_linalg.eigsh(
-            inverse, count, which="LM", v0=start, ncv=min(n, 2 * count + 20)
-        )
-    except sparse_linalg.ArpackError as error:
-        raise InvalidDescriptor(f"the eigensolver did not converge: {error}") from error
-    order = np.argsort(-inverted, kind="stable")
-    return 1.0 / inverted[order] - SHIFT, functions[:, order] / root[:, None]
 
 
 def hks(mesh: Mesh, count: int = 100, eigenpairs: int = 200, partner: Mesh | None = None) -> FloatArray:

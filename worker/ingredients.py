@@ -65,7 +65,7 @@ def make_spectrum(spec: specs.Spectrum, bench: Bench) -> Made:
 
     mesh = bench.read.mesh(spec.mesh)
     bench.step(f"solving for {spec.eigenpairs} eigenpairs", 0.0, 1.0)
-    found = spectrum(mesh, spec.eigenpairs)
+    found = spectrum(mesh, spec.eigenpairs, bench.threads)
     arrays = {"eigenvalues": found.values, "eigenfunctions": found.functions}
     return Made({}, arrays, f"{mesh.n_vertices:,} vertices, {len(found.values)} eigenpairs")
 

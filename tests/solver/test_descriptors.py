@@ -119,3 +119,21 @@ def test_too_few_energies_or_eigenpairs_are_refused(sphere: Mesh) -> None:
         hks(sphere, 10, 1)
     with pytest.raises(InvalidDescriptor, match="positive"):
         hks(sphere, 10, 2)
+
+
+def test_eigenvalues_repeated_more_often_than_a_block_is_wide_are_all_found() -> None:
+    one = torus(16, 12)
+    copies = 12  # more than the first blocks have vectors; every eigenvalue is repeated at least as often
+    vertices = np.concatenate([one.vertices + 10.0 * k for k in range(copies)])
+    faces = np.concatenate([one.faces + k * one.n_vertices for k in range(copies)])
+    values = spectrum(Mesh(vertices, faces), 60).values
+    # A twelfth of the area has twelve times the eigenvalues.
+    alone = copies * spectrum(one, 5).values
+    np.testing.assert_allclose(values, np.repeat(alone, copies), rtol=1e-9, atol=1e-8)
+
+
+def test_the_spectrum_does_not_depend_on_threads() -> None:
+    mesh = icosphere(5)  # more vertices than one piece of rows
+    one, three = spectrum(mesh, 40), spectrum(mesh, 40, threads=3)
+    assert np.array_equal(one.values, three.values)
+    assert np.array_equal(one.functions, three.functions)
