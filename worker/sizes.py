@@ -135,15 +135,15 @@ def basis_cost(spec: specs.Basis, sizes: Sizes) -> Cost:
 
 
 def spectrum_cost(spec: specs.Spectrum, sizes: Sizes) -> Cost:
-    """Lanczos iterations on a sparse factorisation, or all eigenpairs where half of them are wanted."""
+    """A Lanczos basis of 3.3 vectors for each pair on a sparse factorisation; all pairs of small meshes."""
     n_vertices = sizes.mesh(spec.mesh).n_vertices
     pairs = min(spec.eigenpairs, n_vertices)
-    seconds = 0.05 + 6e-7 * n_vertices**1.25 * pairs
-    memory = _FLOAT * n_vertices * (6 * pairs + 250)
-    if 2 * pairs > n_vertices:
-        seconds += 1e-9 * n_vertices**3
-        memory += 3 * _FLOAT * n_vertices**2
-    return Cost(seconds, memory)
+    if n_vertices <= max(600, 4 * pairs):
+        return Cost(0.02 + 5e-10 * n_vertices**3, _FLOAT * n_vertices * (3 * n_vertices + 2 * pairs + 250))
+    vectors = 3.3 * pairs + 50
+    orthogonalising = (3e-10 * n_vertices + 1.5e-9 * vectors) * vectors**2
+    seconds = 0.03 + 1e-7 * n_vertices * vectors + 1e-7 * n_vertices**1.5 + orthogonalising
+    return Cost(seconds, round(_FLOAT * (n_vertices * (6.5 * pairs + 450) + 4 * (8 * pairs + 512) ** 2)))
 
 
 def descriptor_cost(spec: specs.Descriptor, sizes: Sizes) -> Cost:
