@@ -18,10 +18,10 @@ from redis.backoff import NoBackoff
 from redis.retry import Retry
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
-from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.responses import HTMLResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service import artifacts, routes
+from service import artifacts, routes, viewer
 from service.errors import NotReady, problem, register
 from service.metrics import MEDIA_TYPE, RequestMetrics, gauges
 from service.openapi import completed, problems
@@ -86,6 +86,7 @@ def create_app(settings: Settings) -> FastAPI:
     register(app)
     app.include_router(routes.router)
     app.include_router(artifacts.router)
+    app.include_router(viewer.router)
     _add_pages(app)
     _add_health(app)
     token = settings.token.get_secret_value() if settings.token else None
@@ -137,11 +138,6 @@ def _add_pages(app: FastAPI) -> None:
         return app.openapi_schema
 
     app.openapi = openapi  # type: ignore[method-assign]
-
-    @app.get("/", include_in_schema=False)
-    async def door() -> JSONResponse:
-        links = {"docs": "/docs", "openapi": "/openapi.json", "meshes": "/v1/meshes", "jobs": "/v1/jobs"}
-        return JSONResponse({"service": app.title, "version": app.version, "links": links})
 
     @app.get("/docs", include_in_schema=False)
     async def docs() -> HTMLResponse:
@@ -235,7 +231,7 @@ class _Gate:
             self._metrics.observe(known, route, status, time.monotonic() - began)
 
     def _allowed(self, scope: Scope) -> bool:
-        if self._token is None or scope["path"] in _OPEN_PATHS:
+        if self._token is None or scope["path"] in _OPEN_PATHS or viewer.open_to_all(scope):
             return True
         scheme, _, given = Headers(scope=scope).get("authorization", "").partition(" ")
         right = secrets.compare_digest(given.strip().encode("latin-1"), self._token)
