@@ -6,8 +6,7 @@ C_ij = ∫β₀ᵢ(x) [∫ρ_fine(x, y) βⱼ(y) dy] dx / ∫β₀ᵢ.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,13 +17,12 @@ from solver.basis import Basis
 from solver.errors import InvalidDescriptor, InvalidMesh, InvalidSoftMap
 from solver.fem import mass
 from solver.mesh import FloatArray
+from solver.similarity import received_by
 
 #: How far a row of given coefficients may be from summing to 1; ours are within 1e-14.
 ROW_SUM_TOLERANCE = 1e-9
 #: Descriptors that vary less than this, relative to their size, differ by rounding alone.
 SMALLEST_VARIATION = 1e-13
-#: Entries of ρ_fine held at once by one thread when comparing descriptors (16 MB).
-BLOCK_ENTRIES = 2**21
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,20 +123,7 @@ class SoftMap:
         size = max(np.abs(f0).max(), np.abs(f).max())
         if not SMALLEST_VARIATION * size < scale < np.inf:
             raise InvalidDescriptor("the descriptors do not vary", value=float(scale))
-        coefficients = np.zeros((source.size, target.size))
-        # Centred on the target, so that ‖a‖² + ‖b‖² − 2ab loses no digits to a common offset.
-        centre = f.mean(axis=0)
-        kernel = _Similarity((f0 - centre) / scale, (f - centre) / scale, mass(target.mesh), target.functions)
-        weighted = (source.functions.T * (mass(source.mesh))).tocsc()
-        blocks = list(_row_blocks(source.mesh.n_vertices, target.mesh.n_vertices))
-        with ThreadPoolExecutor(threads or 1) as pool:
-            # In order, and one product a block, so that threads cannot change a bit.
-            for done, ((start, stop), rows) in enumerate(
-                zip(blocks, pool.map(kernel, blocks), strict=True), start=1
-            ):
-                coefficients += weighted[:, start:stop] @ rows
-                if progress is not None:
-                    progress(done / len(blocks))
+        coefficients = received_by(source, target, f0 / scale, f / scale, threads, progress)
         return cls(source, target, coefficients / source.integrals[:, None])
 
     @classmethod
@@ -215,32 +200,6 @@ def root_mean_square_distance(
     spread0 = m0 @ ((source_descriptor - mean0) ** 2).sum(axis=1)
     spread = m @ ((target_descriptor - mean) ** 2).sum(axis=1)
     return float(np.sqrt(spread0 + spread + ((mean0 - mean) ** 2).sum()))
-
-
-@dataclass(frozen=True)
-class _Similarity:
-    """Rows of ∫ρ_fine(x, y) βⱼ(y) dy for descriptors in units of s: O(block · V) memory, never V₀ · V."""
-
-    source: FloatArray
-    target: FloatArray
-    target_mass: FloatArray
-    functions: sparse.csr_array
-
-    def __call__(self, block: tuple[int, int]) -> FloatArray:
-        exponent = self.source[slice(*block)] @ (2 * self.target.T)
-        exponent -= (self.target**2).sum(axis=1)
-        # ‖f₀‖² is common to a row: subtracting the largest exponent removes it and keeps exp within range.
-        exponent -= exponent.max(axis=1, keepdims=True)
-        density = np.exp(exponent, out=exponent)
-        density *= self.target_mass
-        received = (self.functions.T @ density.T).T
-        return np.ascontiguousarray(received / received.sum(axis=1, keepdims=True))
-
-
-def _row_blocks(rows: int, columns: int) -> Iterator[tuple[int, int]]:
-    step = max(1, BLOCK_ENTRIES // columns)
-    for start in range(0, rows, step):
-        yield start, min(start + step, rows)
 
 
 def _project(source: Basis, received: sparse.csr_array | FloatArray) -> FloatArray:

@@ -162,9 +162,10 @@ def softmap_cost(spec: specs.SoftMap, sizes: Sizes) -> Cost:
     memory = 4 * _FLOAT * entries + 2_000 * (source.mesh.n_vertices + target.mesh.n_vertices)
     if isinstance(spec.map, specs.Descriptors):
         _, columns = sizes.descriptor(spec.map.source)
-        seconds += (1e-8 + 2e-10 * columns) * source.mesh.n_vertices * target.mesh.n_vertices
-        # 25 MB of similarities a thread, for sixteen threads.
-        memory += _FLOAT * columns * (source.mesh.n_vertices + target.mesh.n_vertices) + 400_000_000
+        seconds += 1.1e-8 * source.mesh.n_vertices * target.mesh.n_vertices
+        # Descriptors scaled, centred and turned, and 3 MB a thread, for sixteen threads.
+        memory += 4 * _FLOAT * columns * (source.mesh.n_vertices + target.mesh.n_vertices) + 50_000_000
+        memory += 16 * 4 * _FLOAT * 256 * target.n_functions
     if isinstance(spec.map, specs.Mixture):
         seconds += 4e-9 * entries * len(spec.map.maps)
         memory += _FLOAT * entries * len(spec.map.maps)

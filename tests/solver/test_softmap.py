@@ -99,7 +99,7 @@ def test_rows_sum_to_one(sigma: float, seed: int) -> None:
 def test_threads_do_not_change_a_bit(
     sphere: Basis, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("solver.softmap.BLOCK_ENTRIES", 20 * sphere.mesh.n_vertices)
+    monkeypatch.setattr("solver.similarity.ROWS", 20)
     f = rng.normal(size=(sphere.mesh.n_vertices, 4))
     seen: list[float] = []
     one = SoftMap.from_descriptors(sphere, sphere, f, f, threads=1, progress=seen.append)
