@@ -52,8 +52,10 @@ from solver.flow import mass_density, momentum, velocity
 from solver.maxent import maxent_basis
 from solver.mesh import Mesh
 from solver.optimal import OptimalMap, optimal_softmap
+from solver.pointmap import PointMap, pointmap
 from solver.potential import FACE_BLOCK, Potential, potential, potential_block
 from solver.prolongation import prolong
+from solver.quality import MapQuality, map_quality, mass_within
 from solver.search import Iteration
 from solver.softmap import SoftMap
 from solver.trace import Path, trace
@@ -69,9 +71,11 @@ __all__ = [
     "InvalidSoftMap",
     "Iteration",
     "LinearConstraint",
+    "MapQuality",
     "Mesh",
     "OptimalMap",
     "Path",
+    "PointMap",
     "Potential",
     "SingularSystem",
     "SoftMap",
@@ -83,10 +87,13 @@ __all__ = [
     "gather_dirichlet",
     "hks",
     "hks_of",
+    "map_quality",
     "mass_density",
+    "mass_within",
     "maxent_basis",
     "momentum",
     "optimal_softmap",
+    "pointmap",
     "poisson_basis",
     "potential",
     "potential_block",

@@ -64,6 +64,17 @@ def test_energy_density_and_gradient_agree_with_the_dense_twin(softmap: SoftMap)
     assert found.residual < 1e-14
 
 
+@pytest.mark.parametrize("target", [fibonacci_sphere(100), torus(20, 10)], ids=["sphere", "torus"])
+def test_faces_whose_rows_agree_are_solved_as_well_as_others(target: Mesh) -> None:
+    """There b is a rounding error along u, which must not be mistaken for a charge."""
+    source, target_basis = poisson_basis(torus(20, 10), size=10), poisson_basis(target, size=10)
+    coefficients = SoftMap.uniform(source, target_basis).coefficients.copy()
+    coefficients[0] = np.eye(10)[0]
+    found = dirichlet(SoftMap(source, target_basis, coefficients))
+    assert found.residual < 1e-14
+    assert found.density.min() < 1e-20
+
+
 @pytest.mark.parametrize("regularisation", [1e-9, 1e-5, 0.1, 0.9])
 def test_any_regularisation_agrees_with_the_dense_twin(softmap: SoftMap, regularisation: float) -> None:
     found = dirichlet(softmap, regularisation, gradient=True)
