@@ -99,3 +99,10 @@ function linear(lightness, a, b) {
 
 /** @param {number} x */
 const gamma = (x) => (x <= 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 2.4) - 0.055);
+
+/** A colour unlike those of the numbers beside it: hues a golden angle apart. @param {number} k @returns {number[]} bytes of sRGB */
+export function distinct(k) {
+  const angle = k * 2.399963;
+  const lightness = 0.62 + 0.09 * ((k * 7) % 4);
+  return shown([lightness, 0.12 * Math.cos(angle), 0.12 * Math.sin(angle)]);
+}

@@ -63,7 +63,8 @@ export class Layer {
     const { low, high } = this.range();
     const { map, logarithmic, isolines } = scale;
     pane.paint.show({ domain: field.domain, values: field.values, low, high, logarithmic, isolines, map, fading: field.fading });
-    this.bar.show(field, scale, low, high, field.domain === "vertex" ? pane.surface.nVertices : pane.surface.nFaces);
+    if (field.fading && !(high > 1e-9)) this.bar.hide();
+    else this.bar.show(field, scale, low, high, field.domain === "vertex" ? pane.surface.nVertices : pane.surface.nFaces);
     this.draw();
   }
 

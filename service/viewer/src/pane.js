@@ -11,7 +11,7 @@ const MARKER = 0.018;
 const BALL = new THREE.SphereGeometry(1, 20, 14);
 
 /** @typedef {{light: boolean, background: number, clay: number, wire: number}} Theme */
-/** @typedef {{vertex: number, colour: number[]}} Marker */
+/** @typedef {{vertex: number, colour: number[], owner?: object}} Marker */
 
 export class Pane {
   /** @param {"source" | "target"} side @param {HTMLCanvasElement} canvas @param {import("./rig.js").Rig} rig */
@@ -78,7 +78,7 @@ export class Pane {
   }
 
   fit() {
-    if (this.surface) this.rig.fit(this.surface.radius, this.aspect);
+    if (this.surface) this.rig.fit([this.surface.positions], this.aspect);
   }
 
   /**
@@ -142,6 +142,12 @@ export class Pane {
     }
   }
 
+  /** @param {?THREE.Object3D} arrows instead of those that are drawn */
+  setArrows(arrows) {
+    clear(this.arrows);
+    if (arrows) this.arrows.add(arrows);
+  }
+
   render() {
     this.stale = false;
     for (const ball of this.markers.children) ball.scale.setScalar(MARKER * this.rig.reach);
@@ -193,6 +199,7 @@ function clear(group) {
   for (const one of /** @type {any[]} */ ([...group.children])) {
     group.remove(one);
     one.material?.dispose();
-    if (one.geometry !== BALL) one.geometry?.dispose();
+    if (one.isInstancedMesh) one.dispose();
+    else if (one.geometry !== BALL && !one.geometry?.userData.shared) one.geometry?.dispose();
   }
 }

@@ -51,10 +51,28 @@ export class Rig {
     this.reach = Math.min(Math.max(this.reach / factor, 1e-3), 100);
   }
 
-  /** @param {number} radius of what is to be seen, around the origin @param {number} aspect */
-  fit(radius, aspect) {
-    this.centre.set(0, 0, 0);
-    this.reach = (1.04 * radius) / Math.min(1, aspect);
+  /**
+   * Go where all of some points are seen, from the same side.
+   *
+   * @param {Float32Array[]} surfaces positions (V, 3) @param {number} aspect width / height
+   */
+  fit(surfaces, aspect) {
+    const { x, y } = this.#axes();
+    const ends = [x, y].map((axis) => {
+      let [low, high] = [Infinity, -Infinity];
+      for (const p of surfaces) {
+        for (let k = 0; k < p.length; k += 3) {
+          const along = axis.x * p[k] + axis.y * p[k + 1] + axis.z * p[k + 2];
+          if (along < low) low = along;
+          if (along > high) high = along;
+        }
+      }
+      return { middle: (low + high) / 2, half: (high - low) / 2 };
+    });
+    const [across, upright] = ends;
+    this.centre.set(0, 0, 0).addScaledVector(x, across.middle).addScaledVector(y, upright.middle);
+    // What is nearer than the centre looks larger, and the colour bars want room.
+    this.reach = 1.22 * Math.max(upright.half, across.half / aspect);
   }
 
   /** A new camera of this rig. @param {number} aspect width / height */

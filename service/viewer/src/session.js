@@ -14,8 +14,9 @@ const LINK_DELAY = 250;
 
 export class Viewer {
   /** @param {{canvases: {source: HTMLCanvasElement, target: HTMLCanvasElement}, overlays: {source: HTMLElement, target: HTMLElement},
-   *          status: HTMLElement}} parts */
-  constructor({ canvases, overlays, status }) {
+   *          status: HTMLElement}} parts @param {import("./jobs.js").Jobs} jobs */
+  constructor({ canvases, overlays, status }, jobs) {
+    this.jobs = jobs;
     this.status = status;
     this.overlays = overlays;
     this.events = new EventTarget();
@@ -83,8 +84,6 @@ export class Viewer {
     this.brush.setSoftMap(null);
     const [first, second] = await Promise.all([source ? surfaceOf(source) : null, target ? surfaceOf(target) : null]);
     this.#setSurfaces(first, second);
-    this.layers.source.show(null);
-    this.layers.target.show(null);
     this.emit("meshes");
   }
 
@@ -97,19 +96,19 @@ export class Viewer {
     const again = this.stage.source.surface === softmap.source.surface && this.stage.target.surface === softmap.target.surface;
     if (!again) this.#setSurfaces(softmap.source.surface, softmap.target.surface);
     this.brush.setSoftMap(softmap);
-    if (!again) this.layers.source.show(null);
-    this.showBrush();
+    this.brush.mark();
+    this.brush.evaluate();
     this.say(`loaded in ${((performance.now() - began) / 1000).toFixed(2)} s; move over the source`);
     this.emit("softmap");
   }
 
-  /** Let the target show μ_x. */
-  showBrush() {
+  /** Let the target show μ_x. @param {Partial<import("./layers.js").Scale>} [scale] */
+  showBrush(scale = {}) {
     const paint = this.stage.target.paint;
     if (!paint) return;
     this.brush.shown = true;
     if (this.brush.vertex < 0) paint.numbers.fill(0);
-    this.layers.target.show({ domain: "vertex", values: paint.numbers, title: "μₓ", unit: "mass / area", fading: true });
+    this.layers.target.show({ domain: "vertex", values: paint.numbers, title: "μₓ", unit: "per area", fading: true }, scale);
     this.brush.evaluate();
     this.layers.target.refreshRange();
     this.brush.tint();

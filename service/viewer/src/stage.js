@@ -16,7 +16,6 @@ export const THEMES = {
 
 /**
  * @typedef {object} Listener what happens on the surfaces
- * @property {(pane: Pane, hit: ?import("./bvh.js").Hit) => void} hover
  * @property {(pane: Pane, hit: import("./bvh.js").Hit) => void} click
  * @property {(pane: Pane, hit: import("./bvh.js").Hit) => boolean} begin whether a drag from here draws
  * @property {(pane: Pane, x: number, y: number) => void} move while drawing
@@ -70,8 +69,8 @@ export class Stage {
 
   fit() {
     if (this.linked) {
-      const radius = Math.max(...this.panes.map((pane) => pane.surface?.radius ?? 0)) || 1;
-      this.source.rig.fit(radius, this.source.aspect);
+      const shown = this.panes.filter((pane) => pane.surface).map((pane) => pane.surface.positions);
+      if (shown.length) this.source.rig.fit(shown, this.source.aspect);
     } else {
       for (const pane of this.panes) pane.fit();
     }

@@ -26,21 +26,6 @@ export class Surface {
     for (let k = 0; k < faces.length; k++) this.vertexAreas[faces[k]] += this.faceAreas[Math.floor(k / 3)] / 3;
     this.normals = vertexNormals(this.positions, faces);
     this.bvh = new Bvh(this.positions, faces);
-    this.radius = 0;
-    for (let k = 0; k < this.positions.length; k += 3) {
-      this.radius = Math.max(this.radius, Math.hypot(this.positions[k], this.positions[k + 1], this.positions[k + 2]));
-    }
-  }
-
-  /** Longest edge of the box around it tells which way is up, unless somebody says otherwise. */
-  get extent() {
-    const low = [Infinity, Infinity, Infinity];
-    const high = [-Infinity, -Infinity, -Infinity];
-    for (let k = 0; k < this.positions.length; k++) {
-      low[k % 3] = Math.min(low[k % 3], this.positions[k]);
-      high[k % 3] = Math.max(high[k % 3], this.positions[k]);
-    }
-    return high.map((x, axis) => x - low[axis]);
   }
 
   /** @param {ArrayLike<number>} point in the file's units @param {number} [at] @returns {[number, number, number]} */
