@@ -30,12 +30,12 @@ JOB_EXAMPLES: dict[str, dict[str, Any]] = {
         },
     },
     "basis": {
-        "summary": "A basis of 300 functions, as the paper makes it",
-        "value": {"kind": "basis", "mesh": _MESH, "size": 300, "method": "poisson", "cutoff": 0.1},
-    },
-    "maxent basis": {
         "summary": "A basis of 300 functions that reproduces linear functions, so that densities converge",
         "value": {"kind": "basis", "mesh": _MESH, "size": 300, "method": "maxent", "sharpness": 3.0},
+    },
+    "poisson basis": {
+        "summary": "A basis of 300 functions, as the paper makes it",
+        "value": {"kind": "basis", "mesh": _MESH, "size": 300, "method": "poisson", "cutoff": 0.1},
     },
     "spectrum": {
         "summary": "The first 200 eigenpairs of a mesh's Laplacian",

@@ -22,7 +22,8 @@ MapOption = Annotated[
 ]
 Size = Annotated[int | None, typer.Option(min=1, help="Functions of each basis; 300, or as a matrix says.")]
 Method = Annotated[
-    str | None, typer.Option(help="How bases are made: poisson or maxent. [dim]The service's default.[/]")
+    str | None,
+    typer.Option(help="How bases are made: maxent, or poisson as in the paper."),
 ]
 Cutoff = Annotated[float | None, typer.Option(help="Cutoff of the poisson basis, in (0, 1).")]
 Sharpness = Annotated[float | None, typer.Option(help="Sharpness of the maxent basis, from 0.5 to 50.")]

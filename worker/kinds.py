@@ -92,8 +92,30 @@ class MaxentBasis(Basis):
     sharpness: Sharpness = 3.0
 
 
-#: Bases by method. The first is meant where a body names none.
-BASES: Final[Mapping[str, type[Basis]]] = {"poisson": PoissonBasis, "maxent": MaxentBasis}
+#: Bases by method.
+BASES: Final[Mapping[str, type[Basis]]] = {"maxent": MaxentBasis, "poisson": PoissonBasis}
+
+
+def with_method(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a basis with the method that they mean: maxent, or poisson where there is only a cutoff.
+
+    Parameters
+    ----------
+    fields : mapping
+
+    Returns
+    -------
+    dict
+        A ``method`` that was named stands as it is; nothing is checked here.
+
+    Raises
+    ------
+    KeyError
+        Never here.
+    """
+    own = PoissonBasis.model_fields.keys() - MaxentBasis.model_fields.keys()
+    meant = "poisson" if own & fields.keys() and "sharpness" not in fields else "maxent"
+    return {"method": meant, **fields}
 
 
 class Spectrum(Spec):

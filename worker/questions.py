@@ -141,7 +141,7 @@ class _Reader:
             fields: dict[str, Any] = dict(value)  # type: ignore[call-overload]
             noted = len(self.errors)
             if model is specs.Basis:
-                fields.setdefault("method", next(iter(specs.BASES)))
+                fields = specs.with_method(fields)
                 model = self._chosen(fields, "method", specs.BASES, pointer)
             if model is specs.SoftMap and "map" in fields:
                 inner = fields["map"] = self._map(fields["map"], f"{pointer}/map", depth)

@@ -32,6 +32,7 @@ from worker.kinds import (
     SoftMap,
     Spec,
     Spectrum,
+    with_method,
 )
 from worker.maps import (
     MAX_MIXED,
@@ -80,6 +81,7 @@ __all__ = [
     "references",
     "spec_id",
     "versions_digest",
+    "with_method",
 ]
 
 #: Every kind that has a spec, public ones first.
@@ -167,7 +169,8 @@ def load(fields: Mapping[str, Any]) -> Spec:
         raise SpecError(("/kind", f"Input should be one of {', '.join(KINDS)}"))
     model = KINDS[kind]
     if model is Basis:
-        method = fields.get("method", next(iter(BASES)))
+        fields = with_method(fields)
+        method = fields["method"]
         if not isinstance(method, str) or method not in BASES:
             raise SpecError(("/method", f"Input should be one of {', '.join(BASES)}"))
         model = BASES[method]

@@ -96,7 +96,7 @@ def test_a_named_descriptor_is_short_for_two_that_share_scales():
 
 
 def test_a_named_descriptor_finds_the_meshes_of_bases_given_by_id():
-    bases = [specs.PoissonBasis(mesh=MESH), specs.PoissonBasis(mesh=OTHER)]
+    bases = [specs.MaxentBasis(mesh=MESH), specs.MaxentBasis(mesh=OTHER)]
     by_id = graph(softmap(*map(specs.spec_id, bases), type="descriptors", descriptor="wks"), bases)
     assert by_id.root == graph(softmap(type="descriptors", descriptor="wks")).root
 
