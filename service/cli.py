@@ -8,6 +8,7 @@ import typer
 
 from service.answering import basis, energy, potential, softmap
 from service.demo import demo
+from service.figures.command import figures
 from service.moving import momentum, path
 from service.operating import api, jobs, up, worker
 
@@ -21,6 +22,7 @@ app = typer.Typer(
 COMMANDS: Mapping[str, Callable[..., None]] = {
     "up": up,
     "demo": demo,
+    "figures": figures,
     "energy": energy,
     "basis": basis,
     "map": softmap,

@@ -27,11 +27,15 @@ LOWEST, HIGHEST = 4.0, 99.0
 LEAST_RATIO = 1.01
 #: Decades of a logarithmic scale at most; below them a density is as good as zero.
 DECADES = 5.0
+#: A number from which on digits behind the point are left out.
+LARGE = 1e4
+#: Labels of a logarithmic scale at most.
+MOST_TICKS = 5
 #: Ratio of its ends from which a logarithmic scale has a label a decade.
 WIDE = 100.0
-#: Width and height of a panel, and how much of the height title and colour bar take, in inches.
+#: Width and height of a panel, how much of the height title and colour bar take, and the longest bar: inches.
 PANEL_INCHES = (5.2, 4.4)
-TITLE_INCHES, BAR_INCHES = 0.3, 0.55
+TITLE_INCHES, BAR_INCHES, LONGEST_BAR = 0.3, 0.55, 4.5
 DPI = 120
 
 
@@ -93,7 +97,7 @@ def dirichlet_panel(vertices: Floats, faces: Ints, density: Floats, energy: floa
     Panel
         Ready for `figure`.
     """
-    title = f"{name}:  $E_D$ = {energy:.4g}"
+    title = f"{name}:  $E_D$ = {_number(energy)}"
     return Panel(vertices, faces, density, title, "Dirichlet energy per unit source area", True, "plasma")
 
 
@@ -118,7 +122,7 @@ def bijectivity_panel(vertices: Floats, faces: Ints, density: Floats, energy: fl
     """
     # No mass at all is an infinite reciprocal: the top of the scale, whatever it is.
     reciprocal = 1.0 / np.maximum(density, np.finfo(np.float64).tiny)
-    title = f"{name}:  $E_b$ = {energy:.4g}"
+    title = f"{name}:  $E_b$ = {_number(energy)}"
     return Panel(vertices, faces, reciprocal, title, "1 / bijectivity density: target area per unit mass")
 
 
@@ -155,35 +159,41 @@ def figure(
     from matplotlib.cm import ScalarMappable  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    width, height = inches
-    drawing = Figure(figsize=(width * len(rows[0]), height * len(rows)), dpi=dpi, layout="constrained")
-    grid = drawing.subplots(len(rows), len(rows[0]), squeeze=False)
-    for line, row in zip(grid, rows, strict=True):
+    width, row_height = inches
+    drawing = Figure(figsize=(width * len(rows[0]), row_height * len(rows)), dpi=dpi)
+    total = width * len(rows[0]), row_height * len(rows)
+
+    def area(left: float, bottom: float, across: float, up: float) -> Any:
+        return drawing.add_axes((left / total[0], bottom / total[1], across / total[0], up / total[1]))
+
+    for k, row in enumerate(rows):
+        bottom = row_height * (len(rows) - 1 - k)
         below = BAR_INCHES if any(panel.label for panel in row) else 0.0
         above = TITLE_INCHES if any(panel.title for panel in row) else 0.0
-        pixels = round(width * dpi), round((height - above - below) * dpi)
+        height = row_height - above - below
+        line = [area(j * width, bottom + below, width, height) for j in range(len(row))]
         for axes, panel in zip(line, row, strict=True):
-            axes.imshow(_drawn(panel, panel.view or view or View(), pixels), interpolation="antialiased")
+            pixels = round(width * dpi), round(height * dpi)
+            axes.imshow(_drawn(panel, panel.view or view or View(), pixels), aspect="auto")
             axes.set_axis_off()
-            axes.set_title(panel.title, fontsize=12)
-        for panel, sharing in _sharing(line, row):
+            axes.set_title(panel.title, fontsize=11)
+        for panel, sharing in _sharing(row):
             scale = ScalarMappable(_scale(panel), panel.colours)
-            bar = drawing.colorbar(
-                scale, ax=sharing, location="bottom", shrink=0.7, aspect=32, pad=0.02, extend="both"
-            )
+            middle = width * (sharing[0] + sharing[-1] + 1) / 2
+            long = min(0.7 * width * len(sharing), LONGEST_BAR)
+            slot = area(middle - long / 2, bottom + below - 0.1, long, 0.09)
+            bar = drawing.colorbar(scale, cax=slot, orientation="horizontal", extend="both")
             _label(bar, panel, scale.get_clim())
     return drawing
 
 
-def _sharing(line: Sequence[Any], row: Sequence[Panel]) -> Iterator[tuple[Panel, list[Any]]]:
-    """Panels that have a colour bar, each with the axes that share it."""
-    positions = {
-        k: (k if panel.limits is None else -1, panel.limits, panel.label) for k, panel in enumerate(row)
-    }
-    for _, group in groupby(positions, positions.__getitem__):
+def _sharing(row: Sequence[Panel]) -> Iterator[tuple[Panel, list[int]]]:
+    """Panels that have a colour bar, each with the positions of those that share it."""
+    keys = [(k if panel.limits is None else -1, panel.limits, panel.label) for k, panel in enumerate(row)]
+    for _, group in groupby(range(len(row)), keys.__getitem__):
         members = list(group)
         if row[members[0]].label:
-            yield row[members[0]], [line[k] for k in members]
+            yield row[members[0]], members
 
 
 def _label(bar: Any, panel: Panel, limits: tuple[float, float]) -> None:
@@ -192,9 +202,9 @@ def _label(bar: Any, panel: Panel, limits: tuple[float, float]) -> None:
     bar.set_label(panel.label, fontsize=9)
     if panel.logarithmic:
         low, high = limits
-        # One label a decade, or three where there are few decades.
-        bar.locator = LogLocator(subs=(1.0,) if high > WIDE * low else (1.0, 2.0, 5.0))
-        bar.formatter = FuncFormatter(lambda value, _position: f"{value:g}")
+        # One label a decade or less often, or three where there are few decades.
+        bar.locator = LogLocator(subs=(1.0,) if high > WIDE * low else (1.0, 2.0, 5.0), numticks=MOST_TICKS)
+        bar.formatter = FuncFormatter(_tick)
         bar.minorticks_off()
         bar.update_ticks()
     bar.ax.tick_params(labelsize=8)
@@ -242,6 +252,16 @@ def write(path: Path, rows: Sequence[Sequence[Panel]], view: View | None = None)
         If the file cannot be written.
     """
     figure(rows, view).savefig(path)
+
+
+def _tick(value: float, _position: int) -> str:
+    """A number, or the power of ten that it is if it is long."""
+    return f"$10^{{{np.log10(value):.0f}}}$" if value >= LARGE else f"{value:g}"
+
+
+def _number(value: float) -> str:
+    """Four digits, and no powers of ten."""
+    return f"{value:,.0f}" if value >= LARGE else f"{value:.4g}"
 
 
 def _scale(panel: Panel) -> Normalize:
