@@ -67,6 +67,8 @@ class Job:
         ISO 8601; None before it happens.
     error : mapping or None
         What went wrong, if it failed.
+    values : mapping
+        What is known so far: of a running optimisation its iteration, energy and gap.
     tasks : tuple of Task
         Parents first, itself last.
     """
@@ -80,6 +82,7 @@ class Job:
     started_at: str | None
     finished_at: str | None
     error: Mapping[str, Any] | None
+    values: Mapping[str, Any]
     tasks: tuple[Task, ...]
 
     @classmethod
@@ -210,3 +213,34 @@ class TracedPath:
     source_points: NDArray[np.float64]
     source_faces: NDArray[np.int64]
     source_barycentric: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class OptimalSoftMap:
+    """A soft map of nearly least energy, and the proof of how nearly.
+
+    Attributes
+    ----------
+    id : str
+        Of the softmap artifact.
+    coefficients : ndarray, (n₀, n) float64
+    energy, dirichlet, bijectivity : float
+        E = E_D + λE_b, and its parts.
+    gap : float
+        No soft map that keeps the landmarks has less energy than ``energy − gap``.
+    converged : bool
+        Whether the gap is as small as was asked for.
+    iterations : int
+    history : mapping of str to ndarray, (iterations + 1,) float64
+        ``energy``, ``gap``, ``evaluations`` and ``seconds`` after each iteration; first come the start's.
+    """
+
+    id: str
+    coefficients: NDArray[np.float64]
+    energy: float
+    dirichlet: float
+    bijectivity: float
+    gap: float
+    converged: bool
+    iterations: int
+    history: Mapping[str, NDArray[np.float64]]

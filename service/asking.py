@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -180,3 +180,35 @@ def _first(where: NDArray[np.bool_]) -> int:
 def softmap(source: Mapping[str, Any], target: Mapping[str, Any], map_: Mapping[str, Any]) -> dict[str, Any]:
     """Spec of a soft map between two bases (specs or ids)."""
     return {"kind": "softmap", "source": source, "target": target, "map": map_}
+
+
+def optimal_softmap(
+    bases: BasisOptions, source: str, target: str, landmarks: Sequence[tuple[int, int]], **options: Any
+) -> dict[str, Any]:
+    """Spec of an optimal soft map between two meshes, on bases that have the landmarks as first samples.
+
+    Parameters
+    ----------
+    bases : BasisOptions
+        How both bases are made.
+    source, target : str
+        Ids of the meshes.
+    landmarks : sequence of (int, int)
+        Pairs of a source and a target vertex.
+    **options
+        More of the map's fields; None leaves the service's default. Its ``method`` is called ``optimiser``.
+
+    Returns
+    -------
+    dict
+        Ready to be submitted.
+    """
+    pairs = [[int(v0), int(v)] for v0, v in landmarks]
+
+    def side(mesh: str, end: int) -> dict[str, Any]:
+        first = list(dict.fromkeys(pair[end] for pair in pairs))
+        return bases.spec(mesh) | ({"first": first} if first else {})
+
+    named = {"method" if name == "optimiser" else name: value for name, value in options.items()}
+    chosen = {name: value for name, value in named.items() if value is not None}
+    return softmap(side(source, 0), side(target, 1), {"type": "optimal", "landmarks": pairs, **chosen})

@@ -11,6 +11,7 @@ from service.demo import demo
 from service.figures.command import figures
 from service.moving import momentum, path
 from service.operating import api, jobs, up, worker
+from service.optimising import optimise
 
 app = typer.Typer(
     add_completion=False,
@@ -29,6 +30,7 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "potential": potential,
     "momentum": momentum,
     "path": path,
+    "optimise": optimise,
     "jobs": jobs,
     "worker": worker,
     "api": api,

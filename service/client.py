@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from service.answers import Artifact, Energies, Job, Motion, TracedPath, Upload
-from service.asking import BasisOptions, map_kind, named_map, softmap
-from service.session import MeshLike, Session
+from service.answers import Artifact, Energies, Job, Motion, OptimalSoftMap, TracedPath
+from service.asking import BasisOptions, optimal_softmap
+from service.preparing import Preparation
+from service.session import MeshLike
 
 #: A soft map: its spec or its id.
 SoftMapLike = Mapping[str, Any] | str
-_MESH_ID = re.compile(r"mesh-[0-9a-f]{32}")
 
 
-class Client(Session):
+class Client(Preparation):
     """A connection to a softmaps service: everything `Session` does, and whole questions in one call.
 
     Parameters
@@ -56,18 +55,8 @@ class Client(Session):
 
         Parameters
         ----------
-        source, target : path, bytes, (vertices, faces) or mesh id
-            The two meshes.
-        map : {"wks", "hks", "uniform"} or array_like
-            Descriptors to compare, or V₀ integers (targets, from 0 on), or an n₀×n matrix of coefficients.
-        size : int
-            Functions of each basis.
-        method : {"poisson", "maxent"}, optional
-            How bases are made; as the service does unless given.
-        cutoff, sharpness : float, optional
-            Of poisson and of maxent bases.
-        sigma : float, optional
-            Of the descriptors.
+        source, target, map, size, method, cutoff, sharpness, sigma
+            As in `softmap`.
         regularisation : float
             ε.
         gradient : bool
@@ -95,41 +84,6 @@ class Client(Session):
         spec = {"kind": "energy", "softmap": asked, "regularisation": regularisation, "gradient": gradient}
         job = self.wait(self.submit(spec).id, progress, timeout)
         return self.energies(job.id, asked["source"]["mesh"], asked["target"]["mesh"])
-
-    def softmap(
-        self,
-        source: MeshLike,
-        target: MeshLike,
-        map: str | ArrayLike = "wks",
-        *,
-        size: int = 300,
-        method: str | None = None,
-        cutoff: float | None = None,
-        sharpness: float | None = None,
-        sigma: float | None = None,
-    ) -> dict[str, Any]:
-        """Spec of a soft map between two meshes, which are uploaded, for `momentum`, `path` and `submit`.
-
-        Parameters
-        ----------
-        source, target, map, size, method, cutoff, sharpness, sigma
-            As in `energy`.
-
-        Returns
-        -------
-        dict
-            With both bases inline.
-
-        Raises
-        ------
-        ClientError
-            If the meshes or the map cannot be uploaded.
-        Unusable
-            If the map fits neither the vertices nor a matrix.
-        """
-        m0, m = self.mesh(source), self.mesh(target)
-        options = BasisOptions(size, method, cutoff, sharpness)
-        return softmap(options.spec(m0.id), options.spec(m.id), self.map_spec(map, m0, m, sigma))
 
     def momentum(
         self,
@@ -213,38 +167,58 @@ class Client(Session):
             id=job.id, length=values["length"], stopped=values["stopped"], **self.arrays(job.id)
         )
 
-    def map_spec(
-        self, map: str | ArrayLike, source: Upload, target: Upload, sigma: float | None = None
-    ) -> dict[str, Any]:
-        """The `map` of a softmap spec, its numbers uploaded if it has any.
+    def optimise(
+        self,
+        source: MeshLike,
+        target: MeshLike,
+        landmarks: Sequence[tuple[int, int]] = (),
+        *,
+        size: int = 60,
+        method: str | None = None,
+        cutoff: float | None = None,
+        sharpness: float | None = None,
+        start: SoftMapLike | None = None,
+        progress: Callable[[Job], None] | None = None,
+        timeout: float | None = None,
+        **options: Any,
+    ) -> OptimalSoftMap:
+        """Soft map of least energy E_D + λE_b between two meshes that keeps landmarks, and the proof of it.
 
         Parameters
         ----------
-        map : str or array_like
-            As in `energy`.
-        source, target : Upload
-            The meshes.
-        sigma : float, optional
-            Of descriptors.
+        source, target, size, method, cutoff, sharpness
+            As in `softmap`. Landmarks are the first samples of the bases.
+        landmarks : sequence of (int, int)
+            Pairs of a source and a target vertex.
+        start : mapping or str, optional
+            Spec or id of a soft map between the same meshes to start from, such as a coarser optimal one.
+        progress, timeout
+            As in `energy`; the job's ``values`` hold iteration, energy and gap; see also `snapshot`.
+        **options
+            ``bijectivity_weight`` (λ), ``tolerance``, ``max_iterations``, ``method`` as ``optimiser``,
+            ``constraints`` and ``regularisation`` of the spec; the service's defaults unless given.
 
         Returns
         -------
-        dict
-            Ready for a spec.
+        OptimalSoftMap
 
         Raises
         ------
-        Unusable
-            If it is no map between these meshes; says why.
         ClientError
-            If the numbers cannot be uploaded.
+            `Invalid`, `JobFailed`, `WaitedTooLong` and others; see ``service.refusals``.
         """
-        if isinstance(map, str):
-            return named_map(map, sigma)
-        array = np.asarray(map)
-        if map_kind(array, source.n_vertices, target.n_vertices) == "points":
-            return {"type": "points", "targets": self.upload_array(array.ravel()).id}
-        return {"type": "matrix", "coefficients": self.upload_array(array.astype(np.float64)).id}
+        bases = BasisOptions(size, method, cutoff, sharpness)
+        spec = optimal_softmap(
+            bases, self.mesh(source).id, self.mesh(target).id, landmarks, start=start, **options
+        )
+        job = self.wait(self.submit(spec).id, progress, timeout)
+        values, arrays = self.artifact(job.id).values, self.arrays(job.id)
+        return OptimalSoftMap(
+            id=job.id,
+            coefficients=arrays.pop("coefficients"),
+            history={name.removeprefix("history_"): array for name, array in arrays.items()},
+            **values,
+        )
 
     def energies(self, id: str, source: str, target: str) -> Energies:
         """Read an energy artifact, given the ids of its meshes.
@@ -290,25 +264,3 @@ class Client(Session):
 
         visit(id)
         return list(found.values())
-
-    def mesh(self, mesh: MeshLike) -> Upload:
-        """Upload a mesh, or look up one that was uploaded.
-
-        Parameters
-        ----------
-        mesh : path, bytes, (vertices, faces) or mesh id
-            As in `energy`.
-
-        Returns
-        -------
-        Upload
-            Its id and facts.
-
-        Raises
-        ------
-        ClientError
-            As `upload_mesh`; `NotFound` for an unknown id.
-        """
-        if isinstance(mesh, str) and _MESH_ID.fullmatch(mesh):
-            return Upload(mesh, self.artifact(mesh).values)
-        return self.upload_mesh(mesh)

@@ -61,6 +61,34 @@ def vertices_option(value: str) -> str:
     return value
 
 
+def landmarks_option(values: list[str] | None) -> list[str] | None:
+    """Check that options are pairs of vertices, joined by a colon.
+
+    Raises
+    ------
+    typer.BadParameter
+        If one is none.
+    """
+    for value in values or []:
+        if not re.fullmatch(r"[0-9]+:[0-9]+", value, re.ASCII):
+            raise typer.BadParameter(f"{value} is no pair of vertices such as 0:17")
+    return values
+
+
+def regions_option(values: list[str] | None) -> list[str] | None:
+    """Check that options are pairs of lists of vertices, joined by a colon.
+
+    Raises
+    ------
+    typer.BadParameter
+        If one is none.
+    """
+    for value in values or []:
+        for region in value.split(":", 1) if ":" in value else [""]:
+            vertices_option(region)
+    return values
+
+
 @dataclass(frozen=True)
 class Pair:
     """Two meshes, a map between them, and bases: what the options say.

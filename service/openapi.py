@@ -45,6 +45,15 @@ JOB_EXAMPLES: dict[str, dict[str, Any]] = {
         "summary": "Wave kernel signature at every vertex",
         "value": {"kind": "descriptor", "mesh": _MESH, "type": "wks", "count": 100, "eigenpairs": 200},
     },
+    "optimal softmap": {
+        "summary": "The soft map of least energy that keeps three landmarks, which are samples of the bases",
+        "value": {
+            "kind": "softmap",
+            "source": {"kind": "basis", "mesh": _MESH, "size": 60, "first": [0, 17, 42]},
+            "target": {"kind": "basis", "mesh": _OTHER, "size": 60, "first": [3, 5, 40]},
+            "map": {"type": "optimal", "landmarks": [[0, 3], [17, 5], [42, 40]], "tolerance": 1e-3},
+        },
+    },
     "momentum": {
         "summary": "Where mass flows on the target as a source point moves along the x axis in face 0",
         "value": {
@@ -124,6 +133,12 @@ ARRAY_CONTENT: dict[str, Any] = {
         RAW: {"schema": _BINARY},
         JSON: {"schema": {"type": "array", "items": {}}},
     },
+}
+#: What an optimisation has found so far.
+SNAPSHOT_CONTENT: dict[str, Any] = {
+    "description": "The coefficients",
+    "headers": {"Iteration": _STRING, "Array-Shape": _STRING, "Array-Dtype": _STRING},
+    "content": {NPY: {"schema": _BINARY}, RAW: {"schema": _BINARY}},
 }
 #: States of a job, one an event.
 EVENTS_CONTENT: dict[str, Any] = {

@@ -68,6 +68,7 @@ class JobLinks(_Reply):
     self: str
     artifact: str
     events: str
+    snapshot: str = Field(description="The best soft map so far, while one is optimised.")
 
 
 class JobReply(_Reply):
@@ -82,6 +83,10 @@ class JobReply(_Reply):
     started_at: str | None
     finished_at: str | None
     error: dict[str, Any] | None
+    values: dict[str, Any] = Field(
+        description="What is known so far: of a running optimisation its iteration, energy and gap; of a "
+        "successful job its artifact's values."
+    )
     tasks: list[TaskReply]
     links: JobLinks
 
@@ -157,8 +162,14 @@ def job_reply(job: Job) -> JobReply:
         started_at=job.started_at,
         finished_at=job.finished_at,
         error=job.error,
+        values=dict(job.values),
         tasks=[TaskReply(id=task.id, kind=task.kind, status=task.status) for task in job.tasks],
-        links=JobLinks(self=base, artifact=f"{PREFIX}/artifacts/{job.id}", events=f"{base}/events"),
+        links=JobLinks(
+            self=base,
+            artifact=f"{PREFIX}/artifacts/{job.id}",
+            events=f"{base}/events",
+            snapshot=f"{base}/snapshot",
+        ),
     )
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
@@ -187,6 +188,26 @@ async def npz_response(request: Request, store: Store, manifest: Manifest, cache
     if matches(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
     return await _answer(request, 200, headers, "application/zip", _zipped(store, manifest))
+
+
+def passing_response(request: Request, array: npt.NDArray[np.float64], headers: dict[str, str]) -> Response:
+    """Answer an array that is about to be another, as npy or raw; no one may keep it.
+
+    Raises
+    ------
+    NotAcceptable
+        If the request accepts neither.
+    """
+    media_type = chosen(request.headers.get("accept"), (NPY, RAW))
+    headers = headers | {"Cache-Control": "no-store", "Vary": "Accept"}
+    headers |= {"Array-Shape": ",".join(map(str, array.shape)), "Array-Dtype": array.dtype.name}
+    content = np.ascontiguousarray(array, dtype=DTYPES[array.dtype.name])
+    body = io.BytesIO()
+    if media_type == NPY:
+        np.save(body, content, allow_pickle=False)
+    else:
+        body.write(content.data)
+    return Response(body.getvalue(), 200, headers, media_type)
 
 
 def matches(header: str | None, etag: str) -> bool:

@@ -18,7 +18,7 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from service.arrays import read_npy
 from service.errors import NotFound, UnsupportedFormat
-from service.openapi import ARRAY_BODY, JOB_BODY, MESH_BODY, known, problems
+from service.openapi import ARRAY_BODY, JOB_BODY, MESH_BODY, SNAPSHOT_CONTENT, known, problems
 from service.receiving import BoundedRequest, mesh_file
 from service.replies import (
     ArrayReply,
@@ -29,6 +29,7 @@ from service.replies import (
     job_reply,
     mesh_reply,
 )
+from service.representations import passing_response
 from service.rooms import Cursor, Id, InRooms, Limit, Name, Rooms, Wait, check_id
 from service.watch import FINISHED, Watch
 from worker.bodies import parse_array
@@ -236,6 +237,23 @@ async def _events(watch: Watch, job: Job) -> AsyncGenerator[bytes]:
         following.cancel()
         await asyncio.gather(following, return_exceptions=True)
         await changes.aclose()
+
+
+@router.get(
+    "/jobs/{id}/snapshot",
+    tags=["jobs"],
+    summary="The best soft map so far",
+    response_class=Response,
+    responses={200: SNAPSHOT_CONTENT, **problems(404, 406, 503)},
+)
+async def get_snapshot(id: Id, request: Request, rooms: InRooms) -> Response:
+    """Download the coefficients (n₀×n) that a running optimisation has found so far, as .npy or raw."""
+    check_id(id)
+    found = await run_in_threadpool(rooms.store.checkpoint, id)
+    if found is None:
+        raise NotFound(f"nothing is known of {id} before it is done, or it is done: see its artifact")
+    headers = {"Iteration": str(found.values["iteration"])}
+    return await run_in_threadpool(passing_response, request, found.arrays["coefficients"], headers)
 
 
 @router.delete(

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from os import PathLike
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -225,6 +225,16 @@ class Session:
         """
         return Job.of(self._transport.ask("DELETE", f"/v1/jobs/{id}"))
 
+    def snapshot(self, id: str) -> NDArray[np.float64]:
+        """Coefficients (n₀, n) of the best soft map so far, while a job optimises one.
+
+        Raises
+        ------
+        ClientError
+            `NotFound` before the first iteration, and once the artifact is there.
+        """
+        return self._array(f"/v1/jobs/{id}/snapshot")
+
     def jobs(self, status: str | None = None) -> Iterator[Job]:
         """All jobs that were asked for, the newest first, page by page.
 
@@ -279,23 +289,7 @@ class Session:
             `NotFound` if there is no such array.
         """
         query = {} if rows is None else {"rows": f"{rows[0]}:{rows[1]}"}
-        accept = {"Accept": "application/octet-stream"}
-        with self._transport.stream(
-            "GET", f"/v1/artifacts/{id}/arrays/{name}", params=query, headers=accept
-        ) as response:
-            shape = tuple(int(length) for length in response.headers["array-shape"].split(",") if length)
-            array = np.empty(shape, np.dtype(response.headers["array-dtype"]).newbyteorder("<"))
-            filled, view = 0, array.reshape(-1).view(np.uint8).data if array.size else memoryview(b"")
-            for chunk in response.iter_bytes():
-                if filled + len(chunk) > array.nbytes:
-                    raise Unreachable(f"the array {name} of {id} came with more bytes than announced")
-                view[filled : filled + len(chunk)] = chunk
-                filled += len(chunk)
-        if filled != array.nbytes:
-            raise Unreachable(
-                f"the array {name} of {id} broke off after {filled:,} of {array.nbytes:,} bytes"
-            )
-        return array.astype(array.dtype.newbyteorder("="), copy=False)
+        return self._array(f"/v1/artifacts/{id}/arrays/{name}", query)
 
     def arrays(self, id: str) -> dict[str, NDArray[Any]]:
         """All arrays of an artifact by name.
@@ -327,3 +321,19 @@ class Session:
         except Silence:
             pass
         return self.job(job.id)
+
+    def _array(self, address: str, query: Mapping[str, str] = MappingProxyType({})) -> NDArray[Any]:
+        """Numbers at an address, into memory of their own."""
+        accept = {"Accept": "application/octet-stream"}
+        with self._transport.stream("GET", address, params=query, headers=accept) as response:
+            shape = tuple(int(length) for length in response.headers["array-shape"].split(",") if length)
+            array = np.empty(shape, np.dtype(response.headers["array-dtype"]).newbyteorder("<"))
+            filled, view = 0, array.reshape(-1).view(np.uint8).data if array.size else memoryview(b"")
+            for chunk in response.iter_bytes():
+                if filled + len(chunk) > array.nbytes:
+                    raise Unreachable(f"{address} came with more bytes than announced")
+                view[filled : filled + len(chunk)] = chunk
+                filled += len(chunk)
+        if filled != array.nbytes:
+            raise Unreachable(f"{address} broke off after {filled:,} of {array.nbytes:,} bytes")
+        return array.astype(array.dtype.newbyteorder("="), copy=False)

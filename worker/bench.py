@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy.typing as npt
 
@@ -13,6 +13,21 @@ from worker.store import BorrowedBlocks
 
 #: Reports a fraction done, from 0 to 1.
 Report = Callable[[float], None]
+
+
+def rest(report: Report, start: float) -> Report:
+    """Report of a whole, given the report of its part from a fraction on."""
+    return lambda done: report((done - start) / (1 - start) if start < 1 else 1.0)
+
+
+class Say(Protocol):
+    """Says what happens from now on; see `Bench`."""
+
+    def __call__(
+        self, words: str, start: float, stop: float, values: Mapping[str, Any] | None = None
+    ) -> Report:
+        """Say it."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +69,16 @@ class Bench:
     threads : int
         Threads that kernels may use.
     step : callable
-        ``step(words, start, stop)`` says what happens from now on and returns the report of that share.
+        ``step(words, start, stop)`` says what happens from now on and returns the report of that share; with
+        ``values``, also what is known so far.
+    task : str
+        Id of the artifact that is being made.
     shards : tuple of str
         Ids of the shards that were planned for this task, in order; they stand.
     """
 
     read: Reader
     threads: int
-    step: Callable[[str, float, float], Report]
+    step: Say
+    task: str
     shards: tuple[str, ...] = ()

@@ -59,6 +59,10 @@ def softmap(spec: specs.SoftMap, sizes: Sizes, settings: Settings) -> Iterator[F
             yield from _points(spec.map, source, sizes)
         case specs.Descriptors():
             yield from _descriptors(spec, source, target, sizes)
+        case specs.Optimal():
+            yield from _optimal(spec.map, source, target)
+            if spec.map.start is not None:
+                yield from _start(spec, spec.map.start, sizes)
         case specs.Matrix():
             shape, _ = sizes.array(spec.map.coefficients)
             wanted = (source.n_functions, target.n_functions)
@@ -67,6 +71,32 @@ def softmap(spec: specs.SoftMap, sizes: Sizes, settings: Settings) -> Iterator[F
                     "/map/coefficients",
                     f"The shape is {_text(shape)}, but should be {_text(wanted)}: (n₀, n)",
                 )
+
+
+def _optimal(chosen: specs.Optimal, source: BasisSize, target: BasisSize) -> Iterator[Flaw]:
+    counts = (source.mesh.n_vertices, target.mesh.n_vertices)
+    for k, pair in enumerate(chosen.landmarks):
+        for end in (0, 1):
+            yield from _vertex(f"/map/landmarks/{k}/{end}", pair[end], counts[end])
+    for k, constraint in enumerate(chosen.constraints):
+        for side, region, count in zip(
+            ("source", "target"), (constraint.source, constraint.target), counts, strict=True
+        ):
+            if max(region) >= count:
+                yield from _vertex(f"/map/constraints/{k}/{side}", max(region), count)
+
+
+def _start(spec: specs.SoftMap, start: str, sizes: Sizes) -> Iterator[Flaw]:
+    earlier = sizes.spec_of(start)
+    assert isinstance(earlier, specs.SoftMap)
+    ends = zip((spec.source, spec.target), (earlier.source, earlier.target), strict=True)
+    if any(_mesh_of(own, sizes) != _mesh_of(other, sizes) for own, other in ends):
+        yield "/map/start", "An optimal map can start from maps between the same two meshes only"
+
+
+def _mesh_of(basis_id: str, sizes: Sizes) -> str | None:
+    spec = sizes.spec_of(basis_id)
+    return spec.mesh if isinstance(spec, specs.Basis) else None
 
 
 def _points(points: specs.Points, source: BasisSize, sizes: Sizes) -> Iterator[Flaw]:

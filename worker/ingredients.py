@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from worker import specs
-from worker.bench import Bench, Made, Report
+from worker.bench import Bench, Made, Report, rest
+from worker.optimum import make_optimal
 
 
 def make_basis(spec: specs.Basis, bench: Bench) -> Made:
@@ -49,14 +50,10 @@ def _in_parts(bench: Bench, *parts: tuple[float, str]) -> Report:
         nonlocal report
         while waiting and done >= waiting[0][0]:
             start, words = waiting.pop(0)
-            report = _rest(bench.step(words, start, 1.0), start)
+            report = rest(bench.step(words, start, 1.0), start)
         report(done)
 
     return progress
-
-
-def _rest(report: Report, start: float) -> Report:
-    return lambda done: report((done - start) / (1 - start))
 
 
 def make_spectrum(spec: specs.Spectrum, bench: Bench) -> Made:
@@ -86,8 +83,11 @@ def make_softmap(spec: specs.SoftMap, bench: Bench) -> Made:
     """Coefficients of a soft map between two bases."""
     from solver import SoftMap  # noqa: PLC0415  (see the module)
 
+    if isinstance(spec.map, specs.Optimal):
+        return make_optimal(spec, bench)
     read = bench.read
     source, target = read.basis(spec.source), read.basis(spec.target)
+    target.require_independent()
     chosen = spec.map
     if isinstance(chosen, specs.Points):
         bench.step(f"projecting {source.mesh.n_vertices:,} targets", 0.0, 1.0)

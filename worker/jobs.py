@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
 import redis
@@ -46,6 +46,8 @@ class Job:
         ISO 8601, UTC.
     error : dict or None
         ``{type, title, detail, index, value, task}`` if it failed.
+    values : mapping
+        What is known so far: what a running task says beside its phase, and the artifact's values at the end.
     tasks : tuple of Task
         Parents first, itself last.
     asked : bool
@@ -61,27 +63,29 @@ class Job:
     started_at: str | None
     finished_at: str | None
     error: dict[str, Any] | None
+    values: Mapping[str, Any]
     tasks: tuple[Task, ...]
     asked: bool
 
 
 @dataclass(frozen=True)
 class Step:
-    """How far a running task is: when it began, the fraction done, and what it does."""
+    """How far a running task is: when it began, the fraction done, what it does, and what it knows so far."""
 
     started_at: str
     fraction: float
     phase: str
+    values: Mapping[str, Any] = field(default_factory=dict)
 
     def dump(self) -> str:
         """As Redis keeps it."""
-        return json.dumps([self.started_at, round(self.fraction, 4), self.phase])
+        return json.dumps([self.started_at, round(self.fraction, 4), self.phase, dict(self.values)])
 
     @classmethod
     def load(cls, said: bytes | str) -> Step:
         """Read what `dump` wrote."""
-        started_at, fraction, phase = json.loads(said)
-        return cls(started_at, float(fraction), phase)
+        started_at, fraction, phase, values = json.loads(said)
+        return cls(started_at, float(fraction), phase, values)
 
 
 def steps(connection: redis.Redis, attempts: Attempts, tasks: Sequence[str]) -> dict[str, Step]:
@@ -140,6 +144,7 @@ class Views:
             started_at=manifest.made.get("started_at"),
             finished_at=manifest.created_at,
             error=None,
+            values=manifest.values,
             tasks=tuple(Task(task.id, task.kind, "successful") for task in record.tasks)
             or (Task(record.id, manifest.kind, "successful"),),
             asked=record.asked,
@@ -168,6 +173,7 @@ class Views:
             started_at=record.started_at or looks.started_at(record),
             finished_at=record.finished_at,
             error=record.problem,
+            values=looks.values(record) if status == "running" else {},
             tasks=tuple(Task(task, kind_of(task) or "", looks.status(task)) for task in _tasks(record)),
             asked=record.asked,
         )
@@ -232,6 +238,12 @@ class _Looks:
         more = f" and {len(words) - 1} more" if len(words) > 1 else ""
         return words[0] + more + (counted if len(tasks) > 1 else "")
 
+    def values(self, record: JobRecord) -> Mapping[str, Any]:
+        """What the last of a job's running tasks that says anything says."""
+        running = [task for task in reversed(_tasks(record)) if self.status(task) == "running"]
+        said = (self._steps[task].values for task in running if task in self._steps)
+        return next(filter(None, said), {})
+
 
 def _words(task: str, step: Step | None) -> str:
     kind = (kind_of(task) or "").replace("_", " ")
@@ -253,6 +265,7 @@ def _answered(manifest: Manifest) -> Job:
         started_at=manifest.made.get("started_at"),
         finished_at=manifest.created_at,
         error=None,
+        values=manifest.values,
         tasks=(Task(manifest.id, manifest.kind, "successful"),),
         asked=False,
     )

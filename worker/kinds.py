@@ -36,7 +36,7 @@ from worker.fields import (
     one_as_tuple,
     one_or_many,
 )
-from worker.maps import Descriptors, Matrix, Mixture, NamedDescriptors, Points, Uniform
+from worker.maps import Descriptors, Matrix, Mixture, NamedDescriptors, Optimal, Points, Uniform
 
 #: Most faces of one question about momentum, and most vertices that one path may pass.
 MAX_MOTIONS: Final = 1_000
@@ -159,7 +159,7 @@ class SoftMap(Spec):
     kind: Literal["softmap"] = "softmap"
     source: BasisId
     target: BasisId
-    map: Annotated[Points | Descriptors | Matrix | Uniform | Mixture, Field(discriminator="type")]
+    map: Annotated[Points | Descriptors | Matrix | Uniform | Mixture | Optimal, Field(discriminator="type")]
 
 
 class NamedSoftMap(Spec):

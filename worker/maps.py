@@ -4,24 +4,38 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal
 
-from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
+from pydantic import BeforeValidator, Field, ValidationInfo, field_serializer, field_validator
 from pydantic_core import PydanticCustomError
 
 from worker.fields import (
     Closed,
     DescriptorId,
+    Fraction,
+    Index,
     MatrixId,
     Positive,
     SoftMapId,
     TargetsId,
     Weight,
     as_tuple,
+    one_as_tuple,
 )
 
 #: Most soft maps that one mixture mixes.
 MAX_MIXED: Final = 1_000
+#: Most landmarks, linear constraints and iterations of one optimal map.
+MAX_LANDMARKS: Final = 1_000
+MAX_CONSTRAINTS: Final = 50
+MAX_ITERATIONS: Final = 10_000
 #: How far the weights of a mixture may sum from 1: far above the rounding of a sum.
 WEIGHT_TOLERANCE: Final = 1e-9
+
+Landmark = Annotated[tuple[Index, Index], BeforeValidator(as_tuple)]
+Region = Annotated[
+    tuple[Index, ...],
+    Field(min_length=1, max_length=100_000, fail_fast=True),
+    BeforeValidator(one_as_tuple),
+]
 
 
 class Points(Closed):
@@ -60,6 +74,66 @@ class Uniform(Closed):
     """The map that sends every point everywhere."""
 
     type: Literal["uniform"] = "uniform"
+
+
+class Constraint(Closed):
+    """Linear constraint: the mass of a source region spreads evenly over a target region.
+
+    A region is a list of vertices, weighted by area; a single vertex is written as the number alone.
+    """
+
+    source: Region
+    target: Region
+
+    @field_serializer("source", "target")
+    def _write_region(self, region: tuple[int, ...]) -> int | tuple[int, ...]:
+        return region[0] if len(region) == 1 else region
+
+
+class Optimal(Closed):
+    """The map of least E_D + λ E_b under landmarks and constraints, proven to a tolerance (§5.3)."""
+
+    type: Literal["optimal"] = "optimal"
+    #: Pairs of a source and a target vertex.
+    landmarks: Annotated[
+        tuple[Landmark, ...],
+        Field(max_length=MAX_LANDMARKS, fail_fast=True),
+        BeforeValidator(as_tuple),
+    ] = ()
+    #: λ.
+    bijectivity_weight: Weight = 1.0
+    #: Gap over energy at which the map is good enough.
+    tolerance: Annotated[float, Field(ge=1e-9, le=1)] = 1e-3
+    max_iterations: Annotated[int, Field(ge=0, le=MAX_ITERATIONS)] = 500
+    method: Literal["interior", "softmax"] = "interior"
+    constraints: Annotated[
+        tuple[Constraint, ...],
+        Field(max_length=MAX_CONSTRAINTS, fail_fast=True),
+        BeforeValidator(as_tuple),
+    ] = ()
+    #: A map between the same two meshes to start from, of any bases; else the uniform map.
+    start: SoftMapId | None = None
+    regularisation: Fraction = 1e-5
+
+    @field_validator("landmarks")
+    @classmethod
+    def _one_target_each(cls, landmarks: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
+        targets: dict[int, int] = {}
+        for k, (v0, v) in enumerate(landmarks):
+            if targets.setdefault(v0, v) != v:
+                raise PydanticCustomError(
+                    "landmarks", "Landmark {k} sends vertex {v0} to a second target", {"k": k, "v0": v0}
+                )
+        return landmarks
+
+    @field_validator("constraints")
+    @classmethod
+    def _by_interior_points(
+        cls, constraints: tuple[Constraint, ...], info: ValidationInfo
+    ) -> tuple[Constraint, ...]:
+        if constraints and info.data.get("method") == "softmax":
+            raise PydanticCustomError("constraints", "Constraints need the method 'interior'")
+        return constraints
 
 
 class Mixture(Closed):

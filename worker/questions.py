@@ -25,7 +25,14 @@ Lookup = Callable[[str], Spec | None]
 
 _MAPS: Final[Mapping[str, type[BaseModel]]] = {
     model.model_fields["type"].default: model
-    for model in (specs.Points, specs.Descriptors, specs.Matrix, specs.Uniform, specs.Mixture)
+    for model in (
+        specs.Points,
+        specs.Descriptors,
+        specs.Matrix,
+        specs.Uniform,
+        specs.Mixture,
+        specs.Optimal,
+    )
 }
 
 

@@ -36,10 +36,12 @@ from worker.kinds import (
 )
 from worker.maps import (
     MAX_MIXED,
+    Constraint,
     Descriptors,
     Matrix,
     Mixture,
     NamedDescriptors,
+    Optimal,
     Points,
     Uniform,
 )
@@ -52,6 +54,7 @@ __all__ = [
     "PUBLIC_KINDS",
     "UPLOADED_KINDS",
     "Basis",
+    "Constraint",
     "Descriptor",
     "Descriptors",
     "Energy",
@@ -62,6 +65,7 @@ __all__ = [
     "Momentum",
     "NamedDescriptors",
     "NamedSoftMap",
+    "Optimal",
     "Path",
     "Points",
     "PoissonBasis",

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
+
+import numpy.typing as npt
 
 from worker.artifacts import Artifacts, Usage
+from worker.checkpoints import Checkpoint, Checkpoints
 from worker.manifests import (
     Block,
     BorrowedBlocks,
@@ -26,6 +30,7 @@ from worker.records import JobRecord, JobRecords, TaskRecord, UnknownJob, cursor
 __all__ = [
     "Block",
     "BorrowedBlocks",
+    "Checkpoint",
     "CorruptArtifact",
     "GoneArtifact",
     "JobRecord",
@@ -46,7 +51,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Swept:
-    """What a sweep removed, blobs and files of writers that died, and jobs whose markers it restored."""
+    """What a sweep removed, blobs and files that nobody waits for, and jobs whose markers it restored."""
 
     blobs: int
     files: int
@@ -64,6 +69,7 @@ class Store(Artifacts):
 
     def __init__(self, root: Path) -> None:
         super().__init__(Objects(root))
+        self._checkpoints = Checkpoints(self._objects)
         self._records = JobRecords(self._objects, lambda id_: self.has(id_) or self.gone(id_) is not None)
 
     @cached_property
@@ -120,8 +126,22 @@ class Store(Artifacts):
         """Delete a record."""
         self._records.delete(id_)
 
+    def write_checkpoint(
+        self, id_: str, values: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]
+    ) -> None:
+        """Write how far a task came, for a later run to go on from."""
+        self._checkpoints.write(id_, values, arrays)
+
+    def checkpoint(self, id_: str) -> Checkpoint | None:
+        """How far a task came, or None."""
+        return self._checkpoints.read(id_)
+
+    def delete_checkpoints(self, id_: str) -> None:
+        """Delete what a task needs no more."""
+        self._checkpoints.delete(id_)
+
     def sweep(self, older_than: float = 86_400.0) -> Swept:
-        """Remove what dead writers left behind, and restore what a power cut took from listings.
+        """Remove what dead writers and given-up tasks left, and restore what a power cut took from listings.
 
         Parameters
         ----------
@@ -129,5 +149,7 @@ class Store(Artifacts):
             Age in seconds below which nothing is removed. No writer may take that long.
         """
         files = self._objects.discard_aside(older_than)
+        waiting = {record.id for record in self.open_jobs()}
+        files += self._checkpoints.discard(older_than, waiting.__contains__)
         blobs = self.discard_orphans(older_than)
         return Swept(blobs=blobs, files=files, jobs=self._records.remark())

@@ -10,8 +10,9 @@ import logging
 import os
 import platform
 import time
+from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import redis
 from redis.backoff import NoBackoff
@@ -158,7 +159,7 @@ class Workplace:
 
         task = record.id
         begun = time.perf_counter()
-        bench = Bench(Reader(self.store), self.threads, notes.step, shards)
+        bench = Bench(Reader(self.store), self.threads, notes.step, task, shards)
         try:
             with blas_pools().limit(limits=1):
                 notes.step("reading", 0.0, 0.0)
@@ -200,6 +201,7 @@ class Workplace:
             },
             adopts=made.adopts,
         )
+        self.store.delete_checkpoints(record.id)
 
     def _fail(self, task: str, found: Problem) -> None:
         """Record a failure."""
@@ -247,12 +249,13 @@ class Notes:
         self._task = task
         self.started_at = now()
         self._phase = "starting"
+        self._values: Mapping[str, Any] = {}
         self._noted = (0.0, 0.0)
         self._paused = 0.0
 
-    def step(self, words: str, start: float, stop: float) -> Report:
+    def step(self, words: str, start: float, stop: float, values: Mapping[str, Any] | None = None) -> Report:
         """Say what happens from now on, and return how to say how much of that share is done."""
-        self._phase = words
+        self._phase, self._values = words, values or {}
         self._note(start, time.monotonic() - self._noted[0] >= 2 * NOTE_SECONDS)
         return self._report(start, stop)
 
@@ -266,7 +269,7 @@ class Notes:
         moment = time.monotonic()
         if not due or moment < self._paused:
             return
-        said = Step(self.started_at, min(1.0, max(0.0, fraction)), self._phase).dump()
+        said = Step(self.started_at, min(1.0, max(0.0, fraction)), self._phase, self._values).dump()
         try:
             self._connection.set(self._attempts.key("progress", self._task), said, ex=jobs.STEP_SECONDS)
             self._noted = (self._noted[1], moment)

@@ -100,6 +100,7 @@ def test_the_openapi_document_is_complete(http: httpx.Client) -> None:
         ("/v1/jobs/{id}", "get"),
         ("/v1/jobs/{id}", "delete"),
         ("/v1/jobs/{id}/events", "get"),
+        ("/v1/jobs/{id}/snapshot", "get"),
         ("/v1/artifacts", "get"),
         ("/v1/artifacts/{id}", "get"),
         ("/v1/artifacts/{id}.npz", "get"),

@@ -79,6 +79,8 @@ def test_help_names_every_command() -> None:
         (["energy", "SPHERE", "SPHERE", "--size", "many"], "valid integer"),
         (["energy", "SPHERE", "SPHERE", "--up", "w"], "is x, y or z"),
         (["path", "SPHERE", "SPHERE", "--start", "0", "--source-path", "0-4"], "no list of vertices"),
+        (["optimise", "SPHERE", "SPHERE", "--landmark", "0,1:2"], "no pair of vertices"),
+        (["optimise", "SPHERE", "SPHERE", "--region", "0,1"], "no list of vertices"),
         (["jobs", "--dismiss"], "name the job to dismiss"),
         (["worker"], "SOFTMAPS_REDIS_URL must name a Redis"),
         (["api"], "SOFTMAPS_REDIS_URL must name a Redis"),
@@ -188,6 +190,19 @@ def test_momentum_and_paths(stack: Stack, sphere: Path, tmp_path: Path) -> None:
     with np.load(tmp_path / "path.npz") as arrays:
         assert found["arrays"]["points"] == list(arrays["points"].shape)
     assert found["values"]["stopped"] == "end"
+
+
+def test_optimise(stack: Stack, sphere: Path, tmp_path: Path) -> None:
+    landmarks = ("--landmark", "0:0", "--landmark", "40:40", "--region", "60,61:60,61")
+    options = ("--size", 12, "--method", "maxent", "--tolerance", 0.01, "--out", tmp_path)
+    done = softmaps("optimise", sphere, sphere, *landmarks, *options, "--json", "--url", stack.url)
+    assert done.returncode == DONE, done.stderr
+    values = json.loads(done.stdout)["values"]
+    assert values["converged"]
+    assert values["gap"] <= 0.01 * values["energy"]
+    with np.load(tmp_path / "softmap.npz") as arrays:
+        assert arrays["coefficients"].shape == (12, 12)
+        assert len(arrays["history_energy"]) == values["iterations"] + 1
 
 
 def test_failures_are_said_in_words_and_in_json(stack: Stack, sphere: Path, tmp_path: Path) -> None:

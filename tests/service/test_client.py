@@ -152,6 +152,46 @@ def test_momentum_and_paths(client: Client, sphere: Mesh) -> None:
         client.path(softmap, [0], 162)
 
 
+def test_an_optimal_map_is_watched_dropped_and_gone_on_with(client: Client, sphere: Mesh) -> None:
+    landmarks = [(0, 0), (40, 41), (100, 99)]
+    seen: list[Job] = []
+
+    def watch(job: Job) -> None:
+        seen.append(job)
+        # Drop it as soon as it has come some way.
+        if job.values.get("iteration", 0) >= 20:
+            client.dismiss(next(task.id for task in job.tasks if task.kind == "softmap"))
+
+    options = {"size": 24, "method": "maxent", "optimiser": "softmax", "tolerance": 1e-9, "timeout": 120}
+    with pytest.raises(JobDismissed) as dropped:
+        client.optimise(sphere, sphere, landmarks, max_iterations=800, progress=watch, **options)
+    running = [job for job in seen if job.values]
+    assert "energy" in running[-1].phase
+    assert {"iteration", "energy", "gap", "evaluations"} == set(running[-1].values)
+    energies = [job.values["energy"] for job in running]
+    assert energies == sorted(energies, reverse=True)
+    # What it had found stays to be looked at, and asking again goes on from there.
+    id_ = dropped.value.job.id
+    snapshot = client.snapshot(id_)
+    assert snapshot.shape == (24, 24)
+    assert np.allclose(snapshot.sum(axis=1), 1)
+    found = client.optimise(sphere, sphere, landmarks, max_iterations=800, **options)
+    assert found.id == id_
+    assert found.iterations <= 800
+    assert found.history["energy"].shape == (found.iterations + 1,)
+    assert found.history["seconds"][-1] > float(client.artifact(id_).made["seconds"])
+    with pytest.raises(NotFound, match="see its artifact"):
+        client.snapshot(id_)
+
+    # The other method proves the same optimum in far fewer iterations; a landmark's row is held.
+    proven = client.optimise(sphere, sphere, landmarks, **{**options, "optimiser": None, "tolerance": 1e-3})
+    assert proven.converged
+    assert proven.iterations < 60
+    assert found.energy - (proven.energy - proven.gap) >= -1e-9
+    assert proven.energy == pytest.approx(proven.dirichlet + proven.bijectivity, rel=1e-12)
+    assert np.sort(proven.coefficients[:3], axis=1)[:, -1] == pytest.approx(1)
+
+
 def test_the_lineage_has_parents_first(client: Client, sphere: Mesh) -> None:
     found = client.energy(sphere, sphere, "uniform", size=12, timeout=120)
     lineage = client.lineage(found.id)
@@ -208,8 +248,8 @@ def test_a_failed_job_carries_its_reason(client: Client, sphere: Mesh) -> None:
     targets = client.upload_array(np.full(len(sphere[0]), -1))
     softmap = {
         "kind": "softmap",
-        "source": basis(mesh.id, 5),
-        "target": basis(mesh.id, 5),
+        "source": basis(mesh.id, 12),
+        "target": basis(mesh.id, 12),
         "map": {"type": "points", "targets": targets.id},
     }
     with pytest.raises(JobFailed, match="-1") as failed:
@@ -332,7 +372,7 @@ def test_an_array_that_breaks_off_is_no_array() -> None:
 def test_events_that_stop_are_looked_after() -> None:
     running = (
         b'{"id": "basis-1", "kind": "basis", "status": "%s", "progress": %d, "phase": "", "tasks": [], '
-        b'"created_at": null, "started_at": null, "finished_at": null, "error": null}'
+        b'"created_at": null, "started_at": null, "finished_at": null, "error": null, "values": {}}'
     )
     first, last = running % (b"running", 10), running % (b"successful", 100)
     stream = b"id: 1\ndata: " + first + b"\n\n"

@@ -140,7 +140,7 @@ def test_equal_inline_lists_are_one_array_and_ints_may_stand_for_floats():
         (energy(softmap(basis(size=0), basis(), type="uniform")), "/softmap/source/size"),
         (energy(softmap(basis({"kind": "mesh"}), basis(), type="uniform")), "/softmap/source/mesh"),
         (energy(softmap(MESH, basis(), type="uniform")), "/softmap/source"),
-        (energy(softmap(type="optimal")), "/softmap/map/type"),
+        (energy(softmap(type="sharpest")), "/softmap/map/type"),
         (energy(softmap()), "/softmap/map/type"),
         (energy(softmap(type="uniform", weights=[1])), "/softmap/map/weights"),
         (energy(softmap(type="points")), "/softmap/map/targets"),

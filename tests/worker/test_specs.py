@@ -21,6 +21,11 @@ MOMENTUM = {"kind": "momentum", "softmap": SOFTMAP, "face": 7, "direction": [1, 
 PATH = {"kind": "path", "softmap": SOFTMAP, "source_path": [3, 1], "start": 0}
 ENDS = {"source": BASIS, "target": BASIS}
 
+
+def optimal(**fields):
+    return {"kind": "softmap", **ENDS, "map": {"type": "optimal", **fields}}
+
+
 #: One flat spec of every kind and map, in its shortest form, and the id that it must have for ever.
 GOLDEN = [
     (POISSON, "basis-6febb9aae45068e32d9c7216160eca95"),
@@ -56,6 +61,16 @@ GOLDEN = [
         {"kind": "softmap", **ENDS, "map": {"type": "mixture", "maps": [SOFTMAP], "weights": [1]}},
         "softmap-56b60944e0313ad48ebbee28f24e7018",
     ),
+    (optimal(), "softmap-910f856eefe92ef1ed810b92e38da056"),
+    (
+        optimal(
+            landmarks=[[3, 4], [5, 6]],
+            bijectivity_weight=2,
+            constraints=[{"source": [1, 2], "target": 7}],
+            start=SOFTMAP,
+        ),
+        "softmap-5cf4d900ec1defb625e853c442fd9525",
+    ),
     ({"kind": "potential", "softmap": SOFTMAP}, "potential-cc88d4df3f49f0310aafd3a26a220eda"),
     ({"kind": "energy", "softmap": SOFTMAP}, "energy-0d83ea4f6b32b9ef3d691feb754a4165"),
     (
@@ -84,7 +99,7 @@ def test_golden_ids_never_change(fields, name):
 def test_every_model_and_map_has_a_golden_id():
     assert {type(specs.load(fields)) for fields, _ in GOLDEN} == set(specs.MODELS)
     maps = {fields["map"]["type"] for fields, _ in GOLDEN if fields["kind"] == "softmap"}
-    assert maps == {"points", "descriptors", "matrix", "uniform", "mixture"}
+    assert maps == {"points", "descriptors", "matrix", "uniform", "mixture", "optimal"}
 
 
 def test_golden_ids_differ_from_one_another():
@@ -216,7 +231,18 @@ def test_a_mesh_shares_its_scales_with_itself():
         ({"kind": "mesh"}, "/kind"),
         ({"kind": ["basis"]}, "/kind"),
         ({}, "/kind"),
-        ({"kind": "softmap", **ENDS, "map": {"type": "optimal"}}, "/map"),
+        ({"kind": "softmap", **ENDS, "map": {"type": "sharpest"}}, "/map"),
+        (optimal(landmarks=[[0, 1, 2]]), "/map/landmarks/0"),
+        (optimal(landmarks=[[0, -1]]), "/map/landmarks/0/1"),
+        (optimal(landmarks=[[0, 1], [0, 2]]), "/map/landmarks"),
+        (optimal(tolerance=0), "/map/tolerance"),
+        (optimal(bijectivity_weight=-1), "/map/bijectivity_weight"),
+        (optimal(max_iterations=10_001), "/map/max_iterations"),
+        (optimal(method="newton"), "/map/method"),
+        (optimal(constraints=[{"source": [], "target": 3}]), "/map/constraints/0/source"),
+        (optimal(constraints=[{"source": 1}]), "/map/constraints/0/target"),
+        (optimal(constraints=[{"source": 1, "target": 1}], method="softmax"), "/map/constraints"),
+        (optimal(start=BASIS), "/map/start"),
         ({"kind": "softmap", **ENDS, "map": {"type": "points"}}, "/map/targets"),
     ],
 )

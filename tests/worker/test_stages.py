@@ -197,13 +197,24 @@ def test_estimates_of_memory_are_bounds(dispatcher: Dispatcher, store: Store, pl
         ask(dispatcher, kind="momentum", softmap=softmap, face=[1] * 50, direction=[[1, 2, 3]] * 50),
         ask(dispatcher, kind="path", softmap=softmap, source_path=[3, 400, 77], start=5),
     ]
+    few = {"kind": "basis", "mesh": mesh, "size": 30}
+    optimal = [
+        ask(
+            dispatcher,
+            kind="softmap",
+            source=few,
+            target=few,
+            map={"type": "optimal", "method": method, "max_iterations": 4},
+        )
+        for method in ("interior", "softmax")
+    ]
     maxent = [
         ask(dispatcher, kind="basis", mesh=mesh, size=60, method="maxent", sharpness=sharpness)
         for sharpness in (1.0, 3.0)
     ]
     place.prepare()
     seen = set()
-    for job in (by_descriptors, potential, *motion, *maxent):
+    for job in (by_descriptors, potential, *motion, *optimal, *maxent):
         record = store.job(job.id)
         assert record is not None
         for task in record.tasks:

@@ -196,7 +196,17 @@ def test_a_failed_shard_fails_the_whole_for_its_own_reason(
     basis = specs.PoissonBasis(mesh=mesh, size=2)
     halves = np.full((2562, 2), 0.5)
     put_basis(store, basis, halves)
-    job = ask(dispatcher, **energy(mesh, 2))
+    softmap = specs.SoftMap(source=specs.spec_id(basis), target=specs.spec_id(basis), map=specs.Uniform())
+    store.put(
+        specs.spec_id(softmap),
+        kind="softmap",
+        spec=specs.dump(softmap),
+        parents=specs.parents(softmap),
+        values={},
+        arrays={"coefficients": np.full((2, 2), 0.5)},
+        made={},
+    )
+    job = ask(dispatcher, kind="energy", softmap=specs.spec_id(softmap))
     run(place, job)
     place.close()
     failed = seen(dispatcher, job.id)
