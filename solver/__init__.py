@@ -29,6 +29,7 @@ b(t)                    bijectivity.density (F,)        mass received per unit t
 1.0
 """
 
+from solver.attachment import descriptor_cost, landmark_distances
 from solver.basis import Basis, poisson_basis
 from solver.descriptors import Spectrum, hks, hks_of, spectrum, wks, wks_of
 from solver.energy import (
@@ -82,11 +83,13 @@ __all__ = [
     "SolverError",
     "Spectrum",
     "bijectivity",
+    "descriptor_cost",
     "dirichlet",
     "dirichlet_block",
     "gather_dirichlet",
     "hks",
     "hks_of",
+    "landmark_distances",
     "map_quality",
     "mass_density",
     "mass_within",

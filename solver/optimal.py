@@ -1,4 +1,4 @@
-"""Optimal soft maps (section 5.3): least E_D + λE_b under landmarks, with a proof of how good they are.
+"""Optimal soft maps (section 5.3): least E_D + λE_b + ⟨K, C⟩ under landmarks, with a proof how good they are.
 
 The problem is convex, so every answer carries a gap that bounds its distance from the true optimum. Two
 methods share one search: the paper's softmax with L-BFGS, and an interior-point method that needs far fewer
@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from solver.basis import Basis
-from solver.errors import SolverError
+from solver.errors import InvalidSoftMap, SolverError
 from solver.feasible import Feasible, LinearConstraint, feasible
 from solver.interior import interior_point
 from solver.mesh import FloatArray
@@ -41,9 +42,9 @@ class OptimalMap:
     ----------
     softmap : SoftMap
     energy : float
-        E = E_D + λE_b.
-    dirichlet, bijectivity : float
-        E_D and E_b.
+        E = E_D + λE_b + ⟨K, C⟩.
+    dirichlet, bijectivity, attachment : float
+        E_D, E_b and ⟨K, C⟩.
     gap : float
         No feasible soft map has less energy than ``energy − gap``.
     converged : bool
@@ -59,6 +60,7 @@ class OptimalMap:
     energy: float
     dirichlet: float
     bijectivity: float
+    attachment: float
     gap: float
     converged: bool
     iterations: int
@@ -91,8 +93,9 @@ def optimal_softmap(
     threads: int | None = None,
     progress: Callable[[float], None] | None = None,
     report: Callable[[Iteration, SoftMap], None] | None = None,
+    cost: npt.ArrayLike = 0.0,
 ) -> OptimalMap:
-    """Soft map of least energy E_D(C) + λE_b(C) over C ≥ 0, C1 = 1, with landmarks held (section 5.3).
+    """Soft map of least energy E_D(C) + λE_b(C) + ⟨K, C⟩ over C ≥ 0, C1 = 1, landmarks held (section 5.3).
 
     This signature is stable: what is added comes after it, by keyword.
 
@@ -124,6 +127,8 @@ def optimal_softmap(
     report : callable, optional
         Called after each iteration with its `Iteration` and the best soft map so far, which can be a later
         ``start``; may raise to abort.
+    cost : (n₀, n) array_like of float, optional
+        K, none by default: see `descriptor_cost`, which draws mass to where descriptors agree.
 
     Returns
     -------
@@ -134,7 +139,7 @@ def optimal_softmap(
     ------
     InvalidSoftMap
         If a landmark does not exist, landmarks contradict each other, no soft map satisfies the constraints,
-        or the start belongs to other meshes; names the culprit.
+        the start belongs to other meshes, or the cost does not fit or is not finite; names the culprit.
     InvalidMesh
         If the target's mesh is not connected.
     SolverError
@@ -145,14 +150,15 @@ def optimal_softmap(
     _check(bijectivity_weight, tolerance, max_iterations, method)
     allowed = feasible(source, target, landmarks, constraints)
     problem = Problem(
-        source,
-        target,
-        allowed,
-        float(bijectivity_weight),
-        tolerance,
-        max_iterations,
-        regularisation,
-        threads or 1,
+        source=source,
+        target=target,
+        feasible=allowed,
+        cost=_checked_cost(cost, allowed.allowed.shape),
+        bijectivity_weight=float(bijectivity_weight),
+        tolerance=tolerance,
+        max_iterations=max_iterations,
+        regularisation=regularisation,
+        threads=threads or 1,
     )
     search = Search(problem, progress, report)
     _METHODS[method](search, _feasible_start(source, target, allowed, start))
@@ -162,6 +168,7 @@ def optimal_softmap(
         energy=best.energy,
         dirichlet=best.dirichlet,
         bijectivity=best.bijectivity,
+        attachment=best.attachment,
         gap=search.gap,
         converged=search.converged,
         iterations=len(search.history) - 1,
@@ -185,6 +192,18 @@ def _feasible_start(source: Basis, target: Basis, allowed: Feasible, start: Soft
         touched = (allowed.weights != 0).any(axis=0)
         coefficients[touched] = allowed.interior[touched]
     return coefficients
+
+
+def _checked_cost(cost: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    given = np.asarray(cost, dtype=np.float64)
+    if given.ndim and given.shape != shape:
+        message = f"the cost must have shape {shape}, not {given.shape}"
+        raise InvalidSoftMap(message, value=str(given.shape))
+    whole = np.broadcast_to(given, shape)
+    bad = np.flatnonzero(~np.isfinite(whole).all(axis=1))
+    if bad.size:
+        raise InvalidSoftMap(f"row {bad[0]} of the cost is not finite", index=int(bad[0]))
+    return whole
 
 
 def _check(weight: float, tolerance: float, max_iterations: int, method: str) -> None:

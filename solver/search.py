@@ -42,12 +42,13 @@ class Iteration:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """E = E_D + λE_b at a soft map.
+    """E = E_D + λE_b + ⟨K, C⟩ at a soft map.
 
     Attributes
     ----------
     softmap : SoftMap
-    energy, dirichlet, bijectivity : float
+    energy, dirichlet, bijectivity, attachment : float
+        E, E_D, E_b and ⟨K, C⟩.
     gradient : ndarray of float64, shape (n₀, n)
     """
 
@@ -55,6 +56,7 @@ class Evaluation:
     energy: float
     dirichlet: float
     bijectivity: float
+    attachment: float
     gradient: FloatArray
 
 
@@ -66,6 +68,8 @@ class Problem:
     ----------
     source, target : Basis
     feasible : Feasible
+    cost : ndarray of float64, shape (n₀, n)
+        K.
     bijectivity_weight : float
         λ.
     tolerance : float
@@ -79,6 +83,7 @@ class Problem:
     source: Basis
     target: Basis
     feasible: Feasible
+    cost: FloatArray
     bijectivity_weight: float
     tolerance: float
     max_iterations: int
@@ -155,12 +160,14 @@ class Search:
         even = bijectivity(softmap)
         assert smooth.gradient is not None
         weight = problem.bijectivity_weight
+        attachment = float((problem.cost * softmap.coefficients).sum())
         evaluation = Evaluation(
-            softmap,
-            smooth.energy + weight * even.energy,
-            smooth.energy,
-            even.energy,
-            smooth.gradient + weight * even.gradient,
+            softmap=softmap,
+            energy=smooth.energy + weight * even.energy + attachment,
+            dirichlet=smooth.energy,
+            bijectivity=even.energy,
+            attachment=attachment,
+            gradient=smooth.gradient + weight * even.gradient + problem.cost,
         )
         self._evaluations += 1
         if self._evaluations == 1 or evaluation.energy < self.best.energy:

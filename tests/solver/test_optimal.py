@@ -151,7 +151,8 @@ def test_the_gap_is_a_directional_derivative(bases: tuple[Basis, Basis], rng: np
     """Σᵢ (Cᵢ·Dᵢ − minⱼ Dᵢⱼ) is minus the slope of E towards the best corner, by central differences."""
     source, target = bases
     allowed = feasible(source, target, [(int(source.samples[0]), int(target.samples[0]))])
-    search = Search(Problem(source, target, allowed, 0.7, 1e-3, 1, 1e-3, 1))
+    cost = rng.random((source.size, target.size))
+    search = Search(Problem(source, target, allowed, cost, 0.7, 1e-3, 1, 1e-3, 1))
     coefficients = np.where(allowed.allowed, rng.dirichlet(np.full(target.size, 3.0), size=source.size), 0.0)
     coefficients /= coefficients.sum(axis=1, keepdims=True)
     evaluation = search.evaluate(coefficients)
@@ -178,6 +179,7 @@ def test_history_tells_of_a_falling_energy_and_a_bound_that_rises(
     assert (bounds <= found.energy).all()
     assert found.iterations == len(found.history) - 1
     assert found.energy == found.dirichlet + found.bijectivity
+    assert found.attachment == 0
     assert found.relative_gap <= 1e-5 < found.strict_gap <= found.gap / (found.energy - 1) * 1.001
     assert all(each.evaluations >= k + 1 for k, each in enumerate(found.history))
 
@@ -187,6 +189,20 @@ def test_landmarks_hold_their_rows(bases: tuple[Basis, Basis], landmarks: list[t
     for method in ("interior", "softmax"):
         found = optimal_softmap(source, target, landmarks, max_iterations=5, method=method)  # type: ignore[arg-type]
         np.testing.assert_array_equal(found.softmap.coefficients[:3], np.eye(target.size)[:3])
+
+
+def test_a_cost_that_outweighs_all_else_is_least_at_a_corner(
+    bases: tuple[Basis, Basis], landmarks: list[tuple[int, int]], rng: np.random.Generator
+) -> None:
+    source, target = bases
+    cost = 1e4 * rng.random((source.size, target.size))
+    found = optimal_softmap(source, target, landmarks, tolerance=1e-6, cost=cost)
+    corner = np.eye(target.size)[cost.argmin(axis=1)]
+    corner[:3] = np.eye(target.size)[:3]
+    np.testing.assert_allclose(found.softmap.coefficients, corner, atol=0.02)
+    assert found.converged
+    assert found.energy == pytest.approx(found.dirichlet + found.bijectivity + found.attachment, rel=1e-14)
+    assert found.attachment == pytest.approx((cost * found.softmap.coefficients).sum(), rel=1e-14)
 
 
 def test_without_landmarks_everything_goes_everywhere(bases: tuple[Basis, Basis]) -> None:
@@ -283,6 +299,11 @@ def test_what_cannot_be_is_refused(tiny: tuple[Basis, Basis]) -> None:
     ):
         with pytest.raises(SolverError, match=argument.split("_")[0]):
             optimal_softmap(source, target, **{argument: value})
+    with pytest.raises(InvalidSoftMap, match=r"shape \(8, 8\), not \(8, 7\)"):
+        optimal_softmap(source, target, cost=np.zeros((8, 7)))
+    with pytest.raises(InvalidSoftMap, match="row 2 of the cost") as refused:
+        optimal_softmap(source, target, cost=np.where(np.arange(8) == 2, np.nan, 0.0)[:, None] * np.ones(8))
+    assert refused.value.index == 2
     with pytest.raises(SolverError, match="rows only"):
         at = LinearConstraint.at_point(source, target, 0, 0)
         optimal_softmap(source, target, constraints=[at], method="softmax")
