@@ -1,12 +1,12 @@
 """Optimal soft maps: energy, proven gap, iterations, seconds, and the error of the point map read off each.
 
     python -m benchmarks.optimal sphere
-    python -m benchmarks.optimal wolves 60 150 300 [--folder DIR] [--basis maxent|poisson] [--tolerance 1e-3]
+    python -m benchmarks.optimal wolves 60 150 300 [--folder DIR] [--basis poisson] [--tolerance 1e-3]
 
-Spheres have one and three landmarks and are their own truth. Wolves have three, the first farthest-point samples
-of one and their true images on the other; each size starts from the uniform map, and from the one before it,
-prolonged. DIR holds ``source__wolf0.off``, ``target__wolf1.off`` and ``gt.txt``. Errors are means over every
-eighth vertex, in √area.
+Spheres have one and three landmarks and are their own truth. Wolves have three, the first farthest-point
+samples of one and their true images on the other; each size starts from the uniform map, and from the one
+before it, prolonged. DIR holds ``source__wolf0.off``, ``target__wolf1.off`` and ``gt.txt``. Errors are means
+over every eighth vertex, in √area.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ LEVELS = (1e-2, 1e-3)
 def head() -> None:
     """Print the names of the columns."""
     print(
-        f"{'map':24}{'n':>5}{'start':>10}{'energy':>11}{'gap/E':>9}{'its':>5}{'evals':>7}{'to 1e-2':>9}{'to 1e-3':>9}"
-        f"{'s':>8}{'peak':>8}{'bary':>8}{'in 0.1':>8}"
+        f"{'map':24}{'n':>5}{'start':>10}{'energy':>11}{'gap/E':>9}{'its':>5}{'evals':>7}{'to 1e-2':>9}"
+        f"{'to 1e-3':>9}{'s':>8}{'peak':>8}{'bary':>8}{'in 0.1':>8}"
     )
 
 
