@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 import typer
 
 from service.answering import basis, energy, potential, softmap
+from service.bench import bench
 from service.demo import demo
 from service.figures.command import figures
 from service.moving import momentum, path
@@ -34,6 +35,7 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "jobs": jobs,
     "worker": worker,
     "api": api,
+    "bench": bench,
 }
 for name, command in COMMANDS.items():
     app.command(name)(command)

@@ -167,13 +167,15 @@ POSES: Mapping[Pose, Mapping[str, Sequence[Turn]]] = {
 }
 
 
-def creature(pose: Pose = "standing") -> tuple[Floats, Ints]:
+def creature(pose: Pose = "standing", subdivisions: int = SUBDIVISIONS) -> tuple[Floats, Ints]:
     """Surface of the creature in one pose.
 
     Parameters
     ----------
     pose : {"standing", "trotting"}
         The first is mirror symmetric in x.
+    subdivisions : int
+        Catmull-Clark steps; each multiplies the faces by four.
 
     Returns
     -------
@@ -190,7 +192,7 @@ def creature(pose: Pose = "standing") -> tuple[Floats, Ints]:
     quads = _cage_quads()
     rest = _pose_cage(POSES["standing"])
     vertices = _pose_cage(POSES[pose])
-    for _ in range(SUBDIVISIONS):
+    for _ in range(subdivisions):
         rest, _finer = _catmull_clark(rest, quads)
         vertices, quads = _catmull_clark(vertices, quads)
     return vertices, _triangles(rest, quads)
