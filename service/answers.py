@@ -244,3 +244,22 @@ class OptimalSoftMap:
     converged: bool
     iterations: int
     history: Mapping[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True, eq=False)
+class PointMap:
+    """A point map read off a soft map.
+
+    Attributes
+    ----------
+    id : str
+        Of the pointmap artifact.
+    targets : ndarray, (V₀,) int64
+        Target vertex of every source vertex, from 0 on; −1 at source vertices in no face.
+    confidence : ndarray, (V₀,) float64
+        Share of the vertex' mass around its target: 1 where the soft map is sure.
+    """
+
+    id: str
+    targets: NDArray[np.int64]
+    confidence: NDArray[np.float64]

@@ -10,7 +10,7 @@ from service.answering import basis, energy, potential, softmap
 from service.bench import bench
 from service.demo import demo
 from service.figures.command import figures
-from service.moving import momentum, path
+from service.moving import momentum, path, pointmap
 from service.operating import api, jobs, up, worker
 from service.optimising import optimise
 
@@ -31,6 +31,7 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "potential": potential,
     "momentum": momentum,
     "path": path,
+    "pointmap": pointmap,
     "optimise": optimise,
     "jobs": jobs,
     "worker": worker,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from service.answers import Artifact, Energies, Job, Motion, OptimalSoftMap, TracedPath
+from service.answers import Artifact, Energies, Job, Motion, OptimalSoftMap, PointMap, TracedPath
 from service.asking import BasisOptions, optimal_softmap
 from service.preparing import Preparation
 from service.session import MeshLike
@@ -166,6 +166,38 @@ class Client(Preparation):
         return TracedPath(
             id=job.id, length=values["length"], stopped=values["stopped"], **self.arrays(job.id)
         )
+
+    def pointmap(
+        self,
+        softmap: SoftMapLike,
+        method: str = "peak",
+        *,
+        progress: Callable[[Job], None] | None = None,
+        timeout: float | None = None,
+    ) -> PointMap:
+        """Target vertex for every source vertex: where its mass peaks, or where on the surface it balances.
+
+        Parameters
+        ----------
+        softmap : mapping or str
+            Spec, such as `softmap` returns, or id.
+        method : {"peak", "barycentre"}
+            Which of the two.
+        progress, timeout
+            As in `energy`.
+
+        Returns
+        -------
+        PointMap
+
+        Raises
+        ------
+        ClientError
+            `Invalid`, `JobFailed`, `WaitedTooLong` and others; see ``service.refusals``.
+        """
+        spec = {"kind": "pointmap", "softmap": softmap, "method": method}
+        job = self.wait(self.submit(spec).id, progress, timeout)
+        return PointMap(id=job.id, **self.arrays(job.id))
 
     def optimise(
         self,

@@ -1,4 +1,4 @@
-"""The commands that follow mass: `momentum` and `path`."""
+"""The commands that follow mass: `momentum`, `path` and `pointmap`."""
 
 from __future__ import annotations
 
@@ -88,3 +88,30 @@ def path(
         question = {"source_path": passed, "start": start, "step": step, "regularisation": regularisation}
         spec = {"kind": "path", "softmap": asked, **question}
         finish(client, screen, answered(client, screen, spec, "path"), out)
+
+
+def pointmap(
+    source: Source,
+    target: Target,
+    by: Annotated[
+        str, typer.Option(help="peak: where mass is densest; barycentre: where on the surface it balances.")
+    ] = "peak",
+    map: MapOption = "wks",
+    size: Size = None,
+    method: Method = None,
+    cutoff: Cutoff = None,
+    sharpness: Sharpness = None,
+    sigma: Sigma = None,
+    url: Url = None,
+    data: Data = None,
+    out: Out = None,
+    json: Json = False,
+) -> None:
+    """Target vertex of every vertex of SOURCE; --out writes them with their confidence (V₀)."""
+    screen = Screen(json)
+    bases = BasisOptions(method=method, cutoff=cutoff, sharpness=sharpness)
+    pair = Pair(source, target, map, size, bases, sigma)
+    with asking(screen, url, data, pair) as client:
+        asked, _ = pair.softmap(client)
+        spec = {"kind": "pointmap", "softmap": asked, "method": by}
+        finish(client, screen, answered(client, screen, spec, "pointmap"), out)

@@ -54,6 +54,14 @@ JOB_EXAMPLES: dict[str, dict[str, Any]] = {
             "map": {"type": "optimal", "landmarks": [[0, 3], [17, 5], [42, 40]], "tolerance": 1e-3},
         },
     },
+    "pointmap": {
+        "summary": "The target vertex at which the mass of each source vertex peaks",
+        "value": {
+            "kind": "pointmap",
+            "softmap": "softmap-0123456789abcdef0123456789abcdef",
+            "method": "peak",
+        },
+    },
     "momentum": {
         "summary": "Where mass flows on the target as a source point moves along the x axis in face 0",
         "value": {

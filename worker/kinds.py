@@ -255,6 +255,15 @@ class Path(_OfSoftMap):
     step: Annotated[float, Field(ge=1e-5, le=1)] = 0.01
 
 
+class PointMap(Spec):
+    """A target vertex for every source vertex: where its mass peaks, or where on the surface it balances."""
+
+    version: ClassVar[int] = 1
+    kind: Literal["pointmap"] = "pointmap"
+    softmap: SoftMapId
+    method: Literal["peak", "barycentre"] = "peak"
+
+
 class _Block(_OfSoftMap):
     private: ClassVar[bool] = True
     start: Index

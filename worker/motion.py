@@ -1,4 +1,4 @@
-"""Tasks that follow the mass of a soft map: momentum at source points, and paths.
+"""Tasks that follow the mass of a soft map: momentum at source points, paths, and where vertices go.
 
 The solver is imported inside functions: whoever only plans tasks must not load it.
 """
@@ -38,3 +38,15 @@ def make_path(spec: specs.Path, bench: Bench) -> Made:
         "source_barycentric": found.source_barycentric,
     }
     return Made({"length": found.length, "stopped": found.stopped}, arrays, f"{len(found.faces):,} points")
+
+
+def make_pointmap(spec: specs.PointMap, bench: Bench) -> Made:
+    """A target vertex for every source vertex, and how sure it is."""
+    from solver import pointmap  # noqa: PLC0415  (see the module)
+
+    softmap = bench.read.softmap(spec.softmap)
+    n_vertices = softmap.source.mesh.n_vertices
+    report = bench.step(f"finding targets of {n_vertices:,} vertices", 0.0, 1.0)
+    found = pointmap(softmap, spec.method, report)
+    arrays = {"targets": found.targets, "confidence": found.confidence}
+    return Made({}, arrays, f"{n_vertices:,} vertices")

@@ -240,6 +240,18 @@ def _optimal_cost(chosen: specs.Optimal, size: MapSize) -> Cost:
     return Cost(min(usual, 1 + chosen.max_iterations) * seconds, memory)
 
 
+def pointmap_cost(spec: specs.PointMap, sizes: Sizes) -> Cost:
+    """A score for every pair of vertices; barycentres also take distances from every sample."""
+    size = sizes.softmap(spec.softmap)
+    pairs = size.source.mesh.n_vertices * size.target.mesh.n_vertices
+    n, n_target = size.target.n_functions, size.target.mesh.n_vertices
+    entries = size.source.mesh.n_vertices * n
+    memory = 400_000_000 + 3 * _FLOAT * (entries + n_target * n)
+    if spec.method == "peak":
+        return Cost(0.1 + 2e-8 * pairs + 1e-8 * entries, memory)
+    return Cost(0.1 + (1e-8 + 3e-10 * n) * pairs + 1e-8 * entries + 2e-6 * n * n_target, memory)
+
+
 def momentum_cost(spec: specs.Momentum, sizes: Sizes) -> Cost:
     """A solve of the faces that are asked for, and two vectors a target face for each."""
     size = sizes.softmap(spec.softmap)

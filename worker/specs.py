@@ -26,6 +26,7 @@ from worker.kinds import (
     Momentum,
     NamedSoftMap,
     Path,
+    PointMap,
     PoissonBasis,
     Potential,
     PotentialBlock,
@@ -67,6 +68,7 @@ __all__ = [
     "NamedSoftMap",
     "Optimal",
     "Path",
+    "PointMap",
     "Points",
     "PoissonBasis",
     "Potential",
@@ -100,6 +102,7 @@ KINDS: Final[Mapping[str, type[Spec]]] = {
         Energy,
         Momentum,
         Path,
+        PointMap,
         PotentialBlock,
         EnergyBlock,
     )

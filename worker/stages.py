@@ -50,6 +50,7 @@ STAGES: Final[Mapping[type[specs.Spec], Stage]] = {
     specs.EnergyBlock: Stage(solves.make_energy_block, sizes.energy_block_cost),
     specs.Momentum: Stage(motion.make_momentum, sizes.momentum_cost, checks.momentum),
     specs.Path: Stage(motion.make_path, sizes.path_cost, checks.path),
+    specs.PointMap: Stage(motion.make_pointmap, sizes.pointmap_cost),
 }
 
 

@@ -190,6 +190,9 @@ def test_momentum_and_paths(stack: Stack, sphere: Path, tmp_path: Path) -> None:
     with np.load(tmp_path / "path.npz") as arrays:
         assert found["arrays"]["points"] == list(arrays["points"].shape)
     assert found["values"]["stopped"] == "end"
+    asked("pointmap", sphere, sphere, "--by", "barycentre")
+    with np.load(tmp_path / "pointmap.npz") as arrays:
+        assert arrays["targets"].shape == arrays["confidence"].shape == (162,)
 
 
 def test_optimise(stack: Stack, sphere: Path, tmp_path: Path) -> None:

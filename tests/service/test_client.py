@@ -146,6 +146,13 @@ def test_momentum_and_paths(client: Client, sphere: Mesh) -> None:
     steps = np.linalg.norm(np.diff(followed.points, axis=0), axis=1)
     assert 0 < steps.sum() <= followed.length * (1 + 1e-12)
 
+    points = client.pointmap(softmap, "barycentre", timeout=60)
+    assert points.targets.shape == points.confidence.shape == (len(sphere[0]),)
+    # A vertex goes to one nearby, and a point map is a map to ask about again.
+    corners = sphere[0][points.targets]
+    assert np.linalg.norm(corners - sphere[0], axis=1).mean() < 0.4
+    assert client.pointmap(client.softmap(sphere, sphere, points.targets, size=12)).confidence.min() > 0
+
     with pytest.raises(Invalid, match="/face/1"):
         client.momentum(softmap, [0, 320], [[1, 0, 0]] * 2)
     with pytest.raises(Invalid, match="/start"):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 
-from solver import momentum, trace, velocity
+from solver import momentum, pointmap, trace, velocity
 from tests.solver.shapes import icosphere
 from tests.worker.conftest import ask, energy, put_mesh, run
 from worker.fields import SpecError
@@ -55,6 +55,21 @@ def test_a_path_is_the_solvers(dispatcher: Dispatcher, store: Store, place: Work
     assert set(manifest.arrays) == set(names)
     for name in names:
         np.testing.assert_array_equal(store.array(manifest, name), getattr(expected, name))
+
+
+@pytest.mark.parametrize("method", ["peak", "barycentre"])
+def test_a_point_map_is_the_solvers(
+    dispatcher: Dispatcher,
+    store: Store,
+    place: Workplace,
+    softmap: str,
+    method: Literal["peak", "barycentre"],
+) -> None:
+    job = ask(dispatcher, kind="pointmap", softmap=softmap, method=method)
+    run(place, job)
+    expected = pointmap(read_softmap(store, softmap), method)
+    np.testing.assert_array_equal(store.array(job.id, "targets"), expected.targets)
+    np.testing.assert_array_equal(store.array(job.id, "confidence"), expected.confidence)
 
 
 @pytest.mark.parametrize(

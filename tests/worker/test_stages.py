@@ -195,6 +195,8 @@ def test_estimates_of_memory_are_bounds(dispatcher: Dispatcher, store: Store, pl
     potential = ask(dispatcher, kind="potential", softmap=softmap)
     motion = [
         ask(dispatcher, kind="momentum", softmap=softmap, face=[1] * 50, direction=[[1, 2, 3]] * 50),
+        ask(dispatcher, kind="pointmap", softmap=softmap),
+        ask(dispatcher, kind="pointmap", softmap=softmap, method="barycentre"),
         ask(dispatcher, kind="path", softmap=softmap, source_path=[3, 400, 77], start=5),
     ]
     few = {"kind": "basis", "mesh": mesh, "size": 30}
