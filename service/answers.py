@@ -224,8 +224,8 @@ class OptimalSoftMap:
     id : str
         Of the softmap artifact.
     coefficients : ndarray, (n₀, n) float64
-    energy, dirichlet, bijectivity : float
-        E = E_D + λE_b, and its parts.
+    energy, dirichlet, bijectivity, attachment : float
+        E = E_D + λE_b + ⟨K, C⟩, and its parts.
     gap : float
         No soft map that keeps the landmarks has less energy than ``energy − gap``.
     converged : bool
@@ -240,6 +240,7 @@ class OptimalSoftMap:
     energy: float
     dirichlet: float
     bijectivity: float
+    attachment: float
     gap: float
     converged: bool
     iterations: int

@@ -228,7 +228,7 @@ class Client(Preparation):
             As in `energy`; the job's ``values`` hold iteration, energy and gap; see also `snapshot`.
         **options
             ``bijectivity_weight`` (λ), ``tolerance``, ``max_iterations``, ``method`` as ``optimiser``,
-            ``constraints`` and ``regularisation`` of the spec; the service's defaults unless given.
+            ``constraints``, ``attachment`` and ``regularisation`` of the spec; else the service's defaults.
 
         Returns
         -------

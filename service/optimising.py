@@ -47,6 +47,9 @@ def optimise(
     tolerance: Annotated[float | None, typer.Option(help="Gap over energy to stop at; 0.001.")] = None,
     max_iterations: Annotated[int | None, typer.Option(min=0, help="Most iterations; 500.")] = None,
     optimiser: Annotated[str | None, typer.Option(help="interior, or the paper's softmax.")] = None,
+    attachment: Annotated[
+        float | None, typer.Option(help="Weight of equal distances to the landmarks, which sharpens; 0.")
+    ] = None,
     start: Annotated[
         str | None, typer.Option(help="Id of a soft map to start from, such as a coarser optimal one.")
     ] = None,
@@ -70,6 +73,7 @@ def optimise(
             tolerance=tolerance,
             max_iterations=max_iterations,
             optimiser=optimiser,
+            attachment=attachment,
             start=start,
             constraints=[{"source": _vertices(one), "target": _vertices(other)} for one, other in regions],
             regularisation=regularisation,

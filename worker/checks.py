@@ -58,9 +58,11 @@ def softmap(spec: specs.SoftMap, sizes: Sizes, settings: Settings) -> Iterator[F
         case specs.Points():
             yield from _points(spec.map, source, sizes)
         case specs.Descriptors():
-            yield from _descriptors(spec, source, target, sizes)
+            yield from _descriptors(spec, (spec.map.source, spec.map.target), source, target, sizes)
         case specs.Optimal():
             yield from _optimal(spec.map, source, target)
+            if spec.map.source is not None and spec.map.target is not None:
+                yield from _descriptors(spec, (spec.map.source, spec.map.target), source, target, sizes)
             if spec.map.start is not None:
                 yield from _start(spec, spec.map.start, sizes)
         case specs.Matrix():
@@ -115,12 +117,13 @@ def _points(points: specs.Points, source: BasisSize, sizes: Sizes) -> Iterator[F
             yield "/map/barycentric", f"The shape is {_text(shape)}, but should be {_text((n_vertices, 3))}"
 
 
-def _descriptors(spec: specs.SoftMap, source: BasisSize, target: BasisSize, sizes: Sizes) -> Iterator[Flaw]:
-    assert isinstance(spec.map, specs.Descriptors)
+def _descriptors(
+    spec: specs.SoftMap, pair: tuple[str, str], source: BasisSize, target: BasisSize, sizes: Sizes
+) -> Iterator[Flaw]:
     columns = []
     for side, basis_id, id_, end in (
-        ("source", spec.source, spec.map.source, source),
-        ("target", spec.target, spec.map.target, target),
+        ("source", spec.source, pair[0], source),
+        ("target", spec.target, pair[1], target),
     ):
         place = f"/map/{side}"
         made, basis_spec = sizes.spec_of(id_), sizes.spec_of(basis_id)

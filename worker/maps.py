@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal
 
-from pydantic import BeforeValidator, Field, ValidationInfo, field_serializer, field_validator
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationInfo, field_serializer, field_validator
 from pydantic_core import PydanticCustomError
 
 from worker.fields import (
@@ -93,6 +93,8 @@ class Constraint(Closed):
 class Optimal(Closed):
     """The map of least E_D + λ E_b under landmarks and constraints, proven to a tolerance (§5.3)."""
 
+    model_config = ConfigDict(validate_default=True)
+
     type: Literal["optimal"] = "optimal"
     #: Pairs of a source and a target vertex.
     landmarks: Annotated[
@@ -114,6 +116,11 @@ class Optimal(Closed):
     #: A map between the same two meshes to start from, of any bases; else the uniform map.
     start: SoftMapId | None = None
     regularisation: Fraction = 1e-5
+    #: Weight of a linear term that sharpens the map: ∫∫ ρ(x, y) ‖f₀(x) − f(y)‖² dy dx.
+    attachment: Weight = 0.0
+    #: Its f₀ and f; without them they are the geodesic distances to the landmarks.
+    source: DescriptorId | None = None
+    target: DescriptorId | None = None
 
     @field_validator("landmarks")
     @classmethod
@@ -134,6 +141,18 @@ class Optimal(Closed):
         if constraints and info.data.get("method") == "softmax":
             raise PydanticCustomError("constraints", "Constraints need the method 'interior'")
         return constraints
+
+    @field_validator("target")
+    @classmethod
+    def _attached_by_something(cls, target: str | None, info: ValidationInfo) -> str | None:
+        attachment, source = info.data.get("attachment", 0.0), info.data.get("source", target)
+        if (source is None) != (target is None):
+            raise PydanticCustomError("target", "Descriptors come in pairs: of the source and of the target")
+        if target is not None and not attachment:
+            raise PydanticCustomError("target", "Descriptors need an attachment above 0")
+        if target is None and attachment and not info.data.get("landmarks", True):
+            raise PydanticCustomError("target", "An attachment needs landmarks or descriptors")
+        return target
 
 
 class Mixture(Closed):

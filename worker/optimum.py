@@ -45,6 +45,7 @@ def make_optimal(spec: specs.SoftMap, bench: Bench) -> Made:
     earlier = Earlier.of(checkpoint)
     if checkpoint is not None:
         start = SoftMap(source, target, checkpoint.arrays["coefficients"])
+    cost = _attachment(chosen, source, target, bench)
     course = _Course(bench, earlier)
     found = optimal_softmap(
         source,
@@ -60,6 +61,7 @@ def make_optimal(spec: specs.SoftMap, bench: Bench) -> Made:
         threads=bench.threads,
         progress=course.progress,
         report=course.report,
+        cost=cost,
     )
     history = course.history
     gap = float(history[-1, 1])
@@ -67,6 +69,7 @@ def make_optimal(spec: specs.SoftMap, bench: Bench) -> Made:
         "energy": found.energy,
         "dirichlet": found.dirichlet,
         "bijectivity": found.bijectivity,
+        "attachment": found.attachment,
         "gap": gap,
         "converged": found.converged or gap <= chosen.tolerance * found.energy,
         "iterations": len(history) - 1,
@@ -75,6 +78,23 @@ def make_optimal(spec: specs.SoftMap, bench: Bench) -> Made:
     arrays |= {f"history_{name}": history[:, k].copy() for k, name in enumerate(HISTORY)}
     words = f"{source.size} × {target.size} functions, {len(history) - 1} iterations"
     return Made(values, arrays, words)
+
+
+def _attachment(
+    chosen: specs.Optimal, source: solver.Basis, target: solver.Basis, bench: Bench
+) -> FloatArray | float:
+    """What draws mass to where descriptors agree, (n₀, n), or 0 for nothing."""
+    from solver import descriptor_cost, landmark_distances  # noqa: PLC0415  (see the module)
+
+    if not chosen.attachment:
+        return 0.0
+    if chosen.source is not None and chosen.target is not None:
+        f0, f = bench.read.descriptor(chosen.source), bench.read.descriptor(chosen.target)
+    else:
+        bench.step(f"distances to {len(chosen.landmarks)} landmarks", 0.0, 0.0)
+        f0 = landmark_distances(source.mesh, [v0 for v0, _ in chosen.landmarks])
+        f = landmark_distances(target.mesh, [v for _, v in chosen.landmarks])
+    return chosen.attachment * descriptor_cost(source, target, f0, f)
 
 
 @dataclass(frozen=True, eq=False)

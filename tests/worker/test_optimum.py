@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from solver import LinearConstraint, maxent_basis, optimal_softmap
+from solver import LinearConstraint, landmark_distances, maxent_basis, optimal_softmap
 from tests.solver.shapes import grid, icosphere
 from tests.worker.conftest import ask, put_mesh, run
 from worker import specs
@@ -54,7 +54,7 @@ def test_an_optimal_map_is_the_solvers(
     expected = optimal_softmap(source, target, pairs, 0.5, 1e-2, 30)
     assert expected.converged
     np.testing.assert_array_equal(store.array(manifest, "coefficients"), expected.softmap.coefficients)
-    for name in ("energy", "dirichlet", "bijectivity", "gap", "converged", "iterations"):
+    for name in ("energy", "dirichlet", "bijectivity", "attachment", "gap", "converged", "iterations"):
         assert manifest.values[name] == getattr(expected, name)
     for name in ("energy", "gap", "evaluations"):
         found = store.array(manifest, f"history_{name}")
@@ -137,6 +137,29 @@ def test_a_running_search_says_what_it_knows(
     checkpoint = store.checkpoint(job.id)
     assert checkpoint is not None
     assert checkpoint.arrays["coefficients"].shape == (16, 16)
+
+
+def test_an_attachment_sharpens_by_distances_or_descriptors(
+    dispatcher: Dispatcher, store: Store, place: Workplace, mesh: str
+) -> None:
+    distances = [landmark_distances(icosphere(2), side).tolist() for side in FIRST]
+    by_landmarks = ask(dispatcher, **softmap(mesh, attachment=10))
+    by_arrays = ask(dispatcher, **softmap(mesh, attachment=10, source=distances[0], target=distances[1]))
+    plain = ask(dispatcher, **softmap(mesh))
+    for job in (by_landmarks, by_arrays, plain):
+        run(place, job)
+    np.testing.assert_array_equal(
+        store.array(by_landmarks.id, "coefficients"), store.array(by_arrays.id, "coefficients")
+    )
+    manifest = store.manifest(by_landmarks.id)
+    assert manifest is not None
+    assert manifest.values["attachment"] > 0
+    assert manifest.values["converged"]
+    assert (store.array(by_landmarks.id, "coefficients") ** 2).sum() > (
+        store.array(plain.id, "coefficients") ** 2
+    ).sum()
+    with pytest.raises(SpecError, match=r"/map/target: .* cannot be compared"):
+        ask(dispatcher, **softmap(mesh, attachment=1, source=[[1.0]] * 162, target=[[1.0, 2.0]] * 162))
 
 
 def test_regions_go_where_they_are_sent(
