@@ -50,7 +50,7 @@ async def door(request: Request) -> Response:
 
 
 @router.get("/viewer/{name}")
-async def bundle(name: str) -> Response:
+async def part(name: str) -> Response:
     """A bundle of the page."""
     path = DIST / name
     media_type = _MEDIA_TYPES.get(path.suffix)

@@ -50,10 +50,7 @@ export function arrowsOn(surface, vectors, weights, size, map) {
 export function oneArrow(from, along, rgb) {
   const vector = new THREE.Vector3(along[0], along[1], along[2]);
   const length = vector.length();
-  // Drawn over the surface: a straight arrow would dive into it.
-  const material = new THREE.MeshLambertMaterial({ color: new THREE.Color().setRGB(...rgb, THREE.SRGBColorSpace), depthTest: false });
-  const mesh = new THREE.Mesh(SHAPE, material);
-  mesh.renderOrder = 2;
+  const mesh = new THREE.Mesh(SHAPE, new THREE.MeshLambertMaterial({ color: new THREE.Color().setRGB(...rgb, THREE.SRGBColorSpace) }));
   mesh.position.set(from[0], from[1], from[2]);
   mesh.quaternion.setFromUnitVectors(new THREE.Vector3(0, 1, 0), vector.normalize());
   mesh.scale.set(0.05, length, 0.05);

@@ -14,6 +14,8 @@ const TRACED = [0.8, 0.1, 0.45];
 const GROWTH = 1600;
 /** Least distance between two vertices of a drawn path, in √area. */
 const STRIDE = 0.05;
+/** Height of an arrow above its face, in √area. */
+const LIFT = 0.015;
 /** Shortest arrow that counts as a direction, in √area. */
 const SHORTEST = 0.01;
 
@@ -190,7 +192,9 @@ export class Motion {
   /** @param {number[]} at @param {number[]} along */
   #showArrow(at, along) {
     const { source } = this.viewer.stage;
-    source.setArrows(oneArrow(at, along, DRAWN));
+    const normal = this.asked ? source.surface.faceNormal(this.asked.face) : [0, 0, 0];
+    // A straight arrow that begins on a curved surface would dive into it.
+    source.setArrows(oneArrow(at.map((x, axis) => x + LIFT * normal[axis]), along, DRAWN));
     this.viewer.stage.draw(source);
   }
 
