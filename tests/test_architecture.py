@@ -14,6 +14,7 @@ from worker.settings import Settings
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = ("solver", "worker", "service")
 MODULES = [path for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
+SCRIPTS = sorted((ROOT / "service" / "viewer" / "src").glob("*.js"))
 #: What a room may import of the others.
 BELOW = {"solver": {"solver"}, "worker": {"solver", "worker"}, "service": set(ROOMS)}
 #: Longer than this, and a file is two rooms.
@@ -38,7 +39,7 @@ def test_the_solver_has_never_heard_of_files_json_or_redis(path: Path) -> None:
     assert not imported_packages(path) & {"json", "pathlib", "redis", "rq", "pydantic", "fastapi", "trimesh"}
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize("path", [*MODULES, *SCRIPTS], ids=lambda path: str(path.relative_to(ROOT)))
 def test_no_module_is_two_rooms(path: Path) -> None:
     assert len(path.read_text().splitlines()) <= LONGEST_MODULE
 

@@ -35,7 +35,7 @@ QUIET = [
     "--disable-component-update",
     "--disable-sync",
 ]
-SIZE = 40
+SIZE = 80
 SECONDS = 60.0
 
 
@@ -114,16 +114,16 @@ class View:
         """Mean colour of what is shown around a vertex."""
         return self.around(side, vertex, self.pixels(side))
 
-    def front(self, side: str) -> list[int]:
-        """The vertices of a ball that are seen from not too much aside."""
+    def front(self, side: str, least: float = 0.5) -> list[int]:
+        """The vertices of a ball whose normals have at least that cosine with the direction to the camera."""
         found: list[int] = self.ask(
-            """(side) => {
+            """([side, least]) => {
               const { rig, surface, aspect } = softmaps.stage[side];
               const eye = rig.camera(aspect).matrixWorld.elements.slice(8, 11);
               const facing = (v) => eye.reduce((sum, x, k) => sum + x * surface.normals[3 * v + k], 0);
-              return Array.from({ length: surface.nVertices }, (_, v) => v).filter((v) => facing(v) > 0.5);
+              return Array.from({ length: surface.nVertices }, (_, v) => v).filter((v) => facing(v) > least);
             }""",
-            side,
+            [side, least],
         )
         return found
 

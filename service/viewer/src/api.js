@@ -4,7 +4,7 @@
  *             arrays: Record<string, {shape: number[], dtype: string, href: string}>}} Artifact */
 /** @typedef {{id: string, kind: string, status: string, progress: number, phase: string, created_at: string,
  *             started_at: ?string, finished_at: ?string, error: ?{title: string, detail: string},
- *             tasks: Array<{id: string, kind: string, status: string}>}} Job */
+ *             tasks: Array<{id: string, kind: string, status: string}>, values?: Record<string, any>}} Job */
 /** @typedef {{data: Float64Array | Int32Array | Uint8Array, shape: number[]}} Numbers */
 
 export const FINISHED = new Set(["successful", "failed", "dismissed"]);
@@ -162,8 +162,16 @@ export function uploadNpy(content, name) {
 export const submit = (spec) =>
   json("/v1/jobs", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(spec) });
 
-/** @param {string} id @returns {Promise<Job>} */
-export const job = (id) => json(`/v1/jobs/${id}`);
+/** @param {string} id of a job @returns {Promise<?Float64Array>} coefficients that its search has found so far */
+export async function snapshot(id) {
+  try {
+    const response = await ask(`/v1/jobs/${id}/snapshot`, { headers: { Accept: "application/octet-stream" } });
+    return new Float64Array(await response.arrayBuffer());
+  } catch (error) {
+    if (error instanceof Refused && error.status === 404) return null;
+    throw error;
+  }
+}
 
 /** @param {string} id @returns {Promise<Job>} */
 export const dismiss = (id) => json(`/v1/jobs/${id}`, { method: "DELETE" });

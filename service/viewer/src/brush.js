@@ -27,8 +27,10 @@ export class Brush {
 
   /** @param {?import("./softmap.js").SoftMap} softmap */
   setSoftMap(softmap) {
-    const same = softmap && this.softmap?.source.surface === softmap.source.surface;
+    const { surface } = this.stage.source;
+    const same = softmap && surface === softmap.source.surface && this.surface === surface;
     this.softmap = softmap;
+    this.surface = surface;
     if (!same) {
       this.vertex = this.peak = -1;
       this.pins = [];

@@ -1,13 +1,12 @@
 /** Optimal maps: landmarks as clicked pairs, and the search that is watched as it nears the optimum. */
 
-import { array, artifact } from "./api.js";
+import { array, artifact, snapshot } from "./api.js";
 import { PIN_COLOURS, css } from "./colours.js";
 import { h, labelled } from "./dom.js";
 import { JobDismissed, inWords } from "./jobs.js";
+import { SoftMap, loadBasis } from "./softmap.js";
 import { short } from "./statistics.js";
 
-/** Gaps over energies at which the search is looked at; each begins where the one before ended. */
-const TOLERANCES = [0.3, 0.1, 0.03, 0.01, 0.003, 0.001];
 const SVG = "http://www.w3.org/2000/svg";
 
 export class Landmarks {
@@ -18,9 +17,12 @@ export class Landmarks {
     this.question = question;
     /** @type {Array<[number, number]>} source and target vertex */
     this.pairs = [];
+    /** Energy and gap of the iterations that were seen. @type {Array<{energy: number, gap: number}>} */
+    this.course = [];
     /** Source vertex that waits for its target. */
     this.waiting = -1;
-    this.weight = h("input", { type: "number", min: 0, step: 0.1, value: 1 });
+    this.weight = h("input", { type: "number", min: 0, step: 0.1, value: 1, "aria-label": "Weight of the bijectivity energy" });
+    this.size = h("input", { type: "number", min: 1, step: 1, value: 60, "aria-label": "Functions of an optimal map" });
     this.list = h("ul", { class: "plain", "aria-label": "Landmarks" });
     this.go = h("button", { type: "button", class: "main", disabled: true, onclick: () => this.optimise() }, "Optimise");
     const clear = h("button", { type: "button", onclick: () => this.set([]) }, "clear landmarks");
@@ -32,6 +34,7 @@ export class Landmarks {
     this.chart.setAttribute("hidden", "");
     parent.append(
       this.list,
+      labelled("functions", this.size, "How many each basis has; the search takes much longer with more"),
       labelled("λ", h("span", { class: "pair" }, this.weight, clear), "Weight of the bijectivity energy"),
       this.go,
       this.note,
@@ -53,41 +56,52 @@ export class Landmarks {
     this.viewer.keepLink();
   }
 
-  /** Search the optimal map from tolerance to tolerance, showing each. */
+  /** Search the optimal map, and show what is known of it meanwhile. */
   async optimise() {
-    const { viewer, question } = this;
-    const points = [0, 1].map((side) => [...new Set(this.pairs.map((pair) => pair[side]))]);
-    const bases = { source: question.basis("source", points[0]), target: question.basis("target", points[1]) };
-    const weight = this.weight.valueAsNumber;
-    /** @type {Array<{energy: number, gap: number}>} */
-    const course = [];
+    const { viewer, question, pairs } = this;
     this.complaint.hidden = true;
     this.go.disabled = true;
+    this.course = [];
     try {
-      let start = null;
-      for (const tolerance of TOLERANCES) {
-        const map = { type: "optimal", landmarks: this.pairs, bijectivity_weight: weight, tolerance, ...(start ? { start } : {}) };
-        const title = `optimal map to ${short(100 * tolerance)} %`;
-        const id = await viewer.jobs.run({ kind: "softmap", ...bases, map }, title, (job) => {
-          this.note.textContent = `${title}: ${job.phase || job.status}`;
-        });
-        const { values } = await artifact(id);
-        course.push(...(await history(id)));
-        this.#draw(course);
-        await viewer.showSoftMap(id);
-        const gap = `${short((100 * values.gap) / values.energy)} %`;
-        this.note.textContent = `Energy ${short(values.energy)} (Dirichlet ${short(values.dirichlet)}); no map is more than ${gap} better. ${course.length} iterations.`;
-        start = id;
-        if (!values.converged) break;
-      }
+      const [source, target] = await Promise.all(
+        /** @type {const} */ (["source", "target"]).map((side, k) => {
+          const first = [...new Set(pairs.map((pair) => pair[k]))];
+          return viewer.jobs.run({ ...question.basis(side, first), size: this.size.valueAsNumber }, `basis of the ${side}`);
+        }),
+      );
+      const bases = await Promise.all([loadBasis(source), loadBasis(target)]);
+      const map = { type: "optimal", landmarks: pairs, bijectivity_weight: this.weight.valueAsNumber };
+      const spec = { kind: "softmap", source, target, map };
+      const id = await viewer.jobs.run(spec, "optimal map", (job) => this.#follow(job, bases));
+      const { values } = await artifact(id);
+      this.course = await history(id);
+      this.#draw();
+      await viewer.showSoftMap(id);
+      const gap = `${short((100 * values.gap) / values.energy)} %`;
+      this.note.textContent = `Energy ${short(values.energy)}, Dirichlet ${short(values.dirichlet)}; no map is more than ${gap} better. ${values.iterations} iterations.`;
       await question.refresh();
     } catch (error) {
-      if (!(error instanceof JobDismissed)) {
-        this.complaint.textContent = inWords(error);
-        this.complaint.hidden = false;
-      } else this.note.textContent = error.message;
+      this.note.textContent = error instanceof JobDismissed ? error.message : "";
+      this.complaint.textContent = error instanceof JobDismissed ? "" : inWords(error);
+      this.complaint.hidden = this.complaint.textContent === "";
     }
     this.#show();
+  }
+
+  /**
+   * A search went on: draw its course, and its best map so far.
+   *
+   * @param {import("./api.js").Job} job @param {import("./softmap.js").Basis[]} bases
+   */
+  async #follow(job, [source, target]) {
+    this.note.textContent = job.phase;
+    const { energy, gap, iteration } = job.values ?? {};
+    if (job.status !== "running" || !(energy > 0) || iteration === this.iteration) return;
+    this.iteration = iteration;
+    this.course.push({ energy, gap });
+    this.#draw();
+    const coefficients = await snapshot(job.id);
+    if (coefficients) this.viewer.preview(new SoftMap(null, source, target, coefficients));
   }
 
   /** @returns {import("./tools.js").Tool} */
@@ -151,8 +165,9 @@ export class Landmarks {
     if (pairs.every(([v0, v]) => fits(v0, source.surface) && fits(v, target.surface))) this.set(pairs);
   }
 
-  /** The energy and what no map is below, over iterations. @param {Array<{energy: number, gap: number}>} course */
-  #draw(course) {
+  /** The energy and what no map is below, over iterations. */
+  #draw() {
+    const { course } = this;
     const [width, height] = [290, 90];
     const bounds = [];
     for (const { energy, gap } of course) bounds.push(Math.max(energy - gap, bounds.at(-1) ?? -Infinity));

@@ -18,7 +18,7 @@ export class Question {
   constructor(viewer, parent, stage) {
     this.viewer = viewer;
     /** What the form says. */
-    this.answer = { source: "", target: "", map: "wks", sigma: 0.1, size: 300, method: "poisson" };
+    this.answer = { source: "", target: "", map: "wks", sigma: 0.1, size: 300, method: "maxent" };
     /** @type {?File} */
     this.file = null;
     const { answer } = this;
@@ -29,7 +29,7 @@ export class Question {
     this.sigma = h("input", { type: "number", min: 0.001, step: 0.01, value: answer.sigma, oninput: () => (answer.sigma = this.sigma.valueAsNumber) });
     const size = h("input", { type: "number", min: 1, step: 1, value: answer.size, "aria-label": "Functions of each basis", oninput: () => (answer.size = size.valueAsNumber) });
     this.size = size;
-    const method = choice([["poisson", "poisson"], ["maxent", "maxent"]], "poisson", (value) => (answer.method = value), "Method of the bases");
+    const method = choice([["maxent", "maximum entropy"], ["poisson", "Poisson"]], "maxent", (value) => (answer.method = value), "Method of the bases");
     const points = h("input", { type: "file", accept: ".txt,.map,.vts,.npy,.csv", onchange: () => (this.file = points.files?.[0] ?? null) });
     this.sigmaRow = labelled("σ", this.sigma, "Distances of descriptors that count as near, in root-mean-square distances");
     this.pointsRow = labelled("target vertices", points, "A file with one target vertex for each source vertex, counted from 0; or a .npy file");

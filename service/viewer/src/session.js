@@ -102,6 +102,13 @@ export class Viewer {
     this.emit("softmap");
   }
 
+  /** Let the brush paint with a soft map that has no name yet. @param {import("./softmap.js").SoftMap} softmap */
+  preview(softmap) {
+    if (softmap.source.surface !== this.stage.source.surface || softmap.target.surface !== this.stage.target.surface) return;
+    this.brush.setSoftMap(softmap);
+    if (this.brush.shown) this.showBrush();
+  }
+
   /** Let the target show μ_x. @param {Partial<import("./layers.js").Scale>} [scale] */
   showBrush(scale = {}) {
     const paint = this.stage.target.paint;
@@ -139,7 +146,7 @@ export class Viewer {
     const { pointer } = this.stage;
     this.keepLink();
     if (this.stage.source.stale) this.#placeCursor();
-    if (!pointer || !this.softmap || pointer.pane !== this.stage.source) return;
+    if (!pointer || !this.brush.softmap || pointer.pane !== this.stage.source) return;
     this.stage.pointer = null;
     const hit = pointer.pane.pick(pointer.x, pointer.y);
     if (hit) this.brush.moveTo(pointer.pane.surface.vertexOf(hit));
@@ -147,7 +154,7 @@ export class Viewer {
 
   /** @param {import("./pane.js").Pane} pane @param {import("./bvh.js").Hit} hit */
   #pin(pane, hit) {
-    if (pane !== this.stage.source || !this.softmap) return;
+    if (pane !== this.stage.source || !this.brush.softmap) return;
     this.brush.moveTo(pane.surface.vertexOf(hit));
     this.brush.pin(this.brush.vertex);
   }
@@ -162,7 +169,7 @@ export class Viewer {
 
   #placeCursor() {
     const { vertex } = this.brush;
-    this.cursor.hidden = vertex < 0 || !this.softmap;
+    this.cursor.hidden = vertex < 0 || !this.brush.softmap;
     if (this.cursor.hidden) return;
     const { x, y } = this.stage.source.seen(vertex);
     this.cursor.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px)`;

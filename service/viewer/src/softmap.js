@@ -48,15 +48,14 @@ export class Basis {
 
 export class SoftMap {
   /**
-   * @param {import("./api.js").Artifact} manifest
+   * @param {?import("./api.js").Artifact} manifest null for what a search has found so far
    * @param {Basis} source
    * @param {Basis} target
    * @param {Float64Array} coefficients (n₀, n)
    */
   constructor(manifest, source, target, coefficients) {
-    this.id = manifest.id;
-    this.spec = manifest.spec;
-    this.values = manifest.values;
+    this.id = manifest?.id ?? null;
+    this.spec = manifest?.spec ?? null;
     this.source = source;
     this.target = target;
     this.coefficients = coefficients;
