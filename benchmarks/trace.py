@@ -21,9 +21,9 @@ from functools import partial
 import numpy as np
 import trimesh
 from scipy import sparse
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from service.figures.spheres import located
 from solver import Basis, Mesh, SoftMap, maxent_basis, poisson_basis, potential, trace
 from solver.flow import gradient_matrix
 from solver.shortest import SurfacePoints, shortest_path
@@ -108,18 +108,6 @@ METHODS: dict[str, Callable[[Case, float], Traced]] = {
 }
 
 
-def on_sphere(mesh: Mesh, points: np.ndarray) -> SurfacePoints:
-    """Faces and barycentric coordinates of directions."""
-    corners = mesh.vertices[mesh.faces]
-    _, candidates = cKDTree(corners.mean(axis=1)).query(points, 20)
-    weights = np.linalg.solve(corners[candidates].swapaxes(2, 3), points[:, None, :, None])[..., 0]
-    weights /= weights.sum(axis=2, keepdims=True)
-    best = weights.min(axis=2).argmax(axis=1)
-    chosen = np.arange(len(points)), best
-    barycentric = np.clip(weights[chosen], 0, 1)
-    return SurfacePoints(candidates[chosen], barycentric / barycentric.sum(axis=1, keepdims=True))
-
-
 def table(cases: Iterator[Case]) -> None:
     """Mean and largest deviation from the image for each step."""
     print(f"\n{'':58}" + "".join(f"{f'step {step}':>17}" for step in STEPS) + f"{'seconds':>9}")
@@ -147,7 +135,7 @@ def spheres() -> Iterator[Case]:
         basis: Basis = make(mesh, size)
         maps = {}
         for label, matrix in (("identity", np.eye(3)), ("rotation", turn), ("reflection", mirror)):
-            image = on_sphere(mesh, mesh.vertices @ matrix.T)
+            image = SurfacePoints(*located(mesh, mesh.vertices @ matrix.T))
             maps[label] = SoftMap.from_points(basis, basis, image.faces, image.barycentric)
         maps["both"] = SoftMap.mixture([maps["identity"], maps["reflection"]], [0.5, 0.5])
         for label, softmap, curve, matrix in (
@@ -156,16 +144,15 @@ def spheres() -> Iterator[Case]:
             ("with reflection, above", maps["both"], high, np.eye(3)),
             ("with reflection, below", maps["both"], high, mirror),
         ):
-            start = on_sphere(mesh, curve[:1] @ matrix.T)
+            start = SurfacePoints(*located(mesh, curve[:1] @ matrix.T))
 
             def image_of(found: Traced, matrix: np.ndarray = matrix) -> np.ndarray:
                 corners = mesh.vertices[mesh.faces[found.source_faces]]
                 return np.einsum("kc,kcx->kx", found.source_barycentric, corners) @ matrix.T
 
             name = f"{make.__name__[:-6]} {size}, {label}"
-            yield Case(
-                name, softmap, on_sphere(mesh, curve), (start.faces[0], start.barycentric[0]), image_of
-            )
+            path = SurfacePoints(*located(mesh, curve))
+            yield Case(name, softmap, path, (start.faces[0], start.barycentric[0]), image_of)
 
 
 def wolves() -> Iterator[Case]:

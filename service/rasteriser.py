@@ -83,7 +83,7 @@ def render(
     covered = np.flatnonzero(hit >= 0)
     face, weight = hit[covered], weights[covered]
     corners = faces[face]
-    normals = np.einsum("pk,pkx->px", weight, _vertex_normals(seen, faces)[corners])
+    normals = np.einsum("pk,pkx->px", weight, vertex_normals(seen, faces)[corners])
     # Both sides are lit, since a mesh may be open or inside out; the face decides which side it is, for the
     # interpolated normal may point away at a silhouette.
     a, b, c = (seen[faces[:, k]] for k in range(3))
@@ -143,7 +143,25 @@ def _rasterise(points: Floats, faces: Ints, width: int, height: int) -> tuple[In
     return hit, weights
 
 
-def _vertex_normals(vertices: Floats, faces: Ints) -> Floats:
+def vertex_normals(vertices: Floats, faces: Ints) -> Floats:
+    """Mean normals of the faces at each vertex, as long as those faces are large.
+
+    Parameters
+    ----------
+    vertices : ndarray, (V, 3) float
+        Positions.
+    faces : ndarray, (F, 3) int
+        Triangles.
+
+    Returns
+    -------
+    ndarray, (V, 3) float
+
+    Raises
+    ------
+    IndexError
+        If a face names a vertex that does not exist.
+    """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normals = np.zeros_like(vertices)
     for k in range(3):

@@ -10,6 +10,7 @@ import numpy as np
 from service.figures.shapes import Shape
 from service.marks import Colour, Floats, Ints, Mark, arrows, balls, tube
 from service.pictures import Panel
+from service.rasteriser import vertex_normals
 from solver import Mesh, SoftMap, momentum
 from solver.geodesics import farthest_point_samples
 from solver.shortest import SurfacePoints, shortest_path
@@ -141,7 +142,8 @@ def field(shape: Shape, vectors: Floats, colour: Colour = RED) -> Mark:
     areas = np.bincount(face_cells, mesh.face_areas, len(samples))
     sums = [np.bincount(face_cells, mesh.face_areas * vectors[:, k], len(samples)) for k in range(3)]
     means = np.column_stack(sums) / np.maximum(areas, 1e-300)[:, None]
-    normals = _normals(mesh)[samples]
+    normals = vertex_normals(mesh.vertices, mesh.faces)[samples]
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     means -= np.einsum("kx,kx->k", means, normals)[:, None] * normals
     lengths = np.linalg.norm(means, axis=1)
     top = np.percentile(lengths, 99.0)
@@ -190,12 +192,3 @@ def _at(mesh: Mesh, vertices: list[int]) -> SurfacePoints:
 def _neighbourhoods(mesh: Mesh) -> tuple[Ints, Ints]:
     samples = farthest_point_samples(mesh, min(ARROWS, mesh.n_vertices // 2), 0)
     return samples.cells, samples.vertices
-
-
-def _normals(mesh: Mesh) -> Floats:
-    """Unit normals at vertices."""
-    sums = np.zeros((mesh.n_vertices, 3))
-    for k in range(3):
-        np.add.at(sums, mesh.faces[:, k], mesh.normals * mesh.face_areas[:, None])
-    normals: Floats = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)
-    return normals
