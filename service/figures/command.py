@@ -54,8 +54,10 @@ def figures(
     unknown = [name for name in names or () if name not in FIGURES]
     if unknown:
         raise typer.BadParameter(f"{unknown[0]} is none of {', '.join(FIGURES)}")
-    from service.figures.shapes import Shelf  # noqa: PLC0415  (loads the solver)
+    from service.figures.shapes import FOLDERS, Shelf  # noqa: PLC0415  (loads the solver)
 
+    if meshes is not None and not any((meshes / folder).is_dir() for folder in FOLDERS):
+        raise typer.BadParameter(f"{meshes} holds none of {', '.join(FOLDERS)}", param_hint="--meshes")
     screen, shelf, drawn = Screen(json), Shelf(meshes), {}
     interrupt_on_termination()
     out.mkdir(parents=True, exist_ok=True)

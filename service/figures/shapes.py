@@ -107,6 +107,16 @@ ARM = {
 }  # fmt: skip
 
 
+#: Subfolders that real meshes are looked for in.
+WOLVES, ANTS, HANDS, ARMS, SERIES = FOLDERS = (
+    "academic_tosca_wolf0_wolf1",
+    "academic_shrec07_ant_88_90",
+    "free_hand_woman_man",
+    "free_arm_woman_man",
+    "repo_series_cheburashka",
+)
+
+
 @dataclass(frozen=True)
 class Shelf:
     """Where shapes are taken from.
@@ -114,8 +124,8 @@ class Shelf:
     Attributes
     ----------
     folder : Path or None
-        Its subfolders hold pairs of meshes, ``source__*``, ``target__*`` and ``gt.txt``, or a series
-        ``pose*``.
+        Its subfolders, `FOLDERS`, hold pairs of meshes, ``source__*``, ``target__*`` and ``gt.txt``, or a
+        series ``pose*``. Built-in shapes stand in for those that are not there.
     """
 
     folder: Path | None = None
@@ -143,46 +153,41 @@ class Shelf:
     @cached_property
     def wolves(self) -> Pair:
         """A wolf, standing and rearing; else the creature."""
-        name = "academic_tosca_wolf0_wolf1"
-        if not self._has(name):
+        if not self._has(WOLVES):
             return self.creatures
         limb = ("shin", "knee", "shoulder", "side")
-        found = self._pair(name, "wolf", View(-20, 10), WOLF, limb)
+        found = self._pair(WOLVES, "wolf", View(-20, 10), WOLF, limb)
         return replace(found, landmarks=("nose", "tail", "foot"), ahead=View(-68.0, 5.0))
 
     @cached_property
     def ants(self) -> Pair:
         """Two ants; else the creature."""
-        name = "academic_shrec07_ant_88_90"
-        if not self._has(name):
+        if not self._has(ANTS):
             return self.creatures
         ways = (("leg", "leg tip"), ("feeler", "feeler tip"), ("tail", "waist"))
         return replace(
-            self._pair(name, "ant", View(60, 50), ANT, ("leg tip", "leg", "waist", "tail")), ways=ways
+            self._pair(ANTS, "ant", View(60, 50), ANT, ("leg tip", "leg", "waist", "tail")), ways=ways
         )
 
     @cached_property
     def hands(self) -> Pair:
         """The hands of a woman and a man; else the creature."""
-        name = "free_hand_woman_man"
-        if not self._has(name):
+        if not self._has(HANDS):
             return self.creatures
-        return self._pair(name, "hand", View(-30, 60, 1), HAND, ("tip", "finger", "knuckle", "wrist"))
+        return self._pair(HANDS, "hand", View(-30, 60, 1), HAND, ("tip", "finger", "knuckle", "wrist"))
 
     @cached_property
     def arms(self) -> Pair:
         """The arms of a woman and a man; else the creature."""
-        name = "free_arm_woman_man"
-        if not self._has(name):
+        if not self._has(ARMS):
             return self.creatures
-        return self._pair(name, "arm", View(-20, 40, 1), ARM, ("hand", "wrist", "forearm", "upper arm"))
+        return self._pair(ARMS, "arm", View(-20, 40, 1), ARM, ("hand", "wrist", "forearm", "upper arm"))
 
     @cached_property
     def series(self) -> tuple[Shape, ...]:
         """One shape and four deformations of it, vertex for vertex."""
-        name = "repo_series_cheburashka"
-        if self.folder is not None and self._has(name):
-            meshes = [_mesh(path) for path in sorted((self.folder / name).glob("pose*"))]
+        if self.folder is not None and self._has(SERIES):
+            meshes = [_mesh(path) for path in sorted((self.folder / SERIES).glob("pose*"))]
             return tuple(Shape(mesh, View(25, 10, 1)) for mesh in meshes)
         return tuple(Shape(Mesh(*deformed), View(32, 14)) for deformed in deformations())
 

@@ -34,6 +34,9 @@ def test_a_figure_from_the_command_line(tmp_path: Path) -> None:
     wrong = CliRunner().invoke(app, ["figures", "portraits", "--out", str(tmp_path)])
     assert wrong.exit_code == 2
     assert "portraits is none of" in wrong.output
+    empty = CliRunner().invoke(app, ["figures", "bases", "--meshes", str(tmp_path), "--out", str(tmp_path)])
+    assert empty.exit_code == 2
+    assert "--meshes" in empty.output
 
 
 def test_built_in_shapes_stand_in_for_meshes_that_are_not_there(tmp_path: Path) -> None:
