@@ -20,7 +20,7 @@ from solver.search import Evaluation, Search
 from solver.superfaces import super_faces
 
 #: Super-faces for each source function: more cost more and gain little (docs/decisions/optimal.md).
-SUPER_FACES = 4
+SUPER_FACES = 2
 #: Steps that correct the curvature as BFGS does.
 MEMORY = 5
 #: μ aims at this share of what the gap is worth in it, but falls by no more than LEAST_CENTRING a step.
