@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
+
 import numpy as np
 import pytest
 
-from solver import trace as tracing
 from solver.basis import Basis
 from solver.errors import SolverError
 from solver.maxent import maxent_basis
@@ -169,7 +170,8 @@ def test_only_the_faces_that_are_crossed_are_solved(
         solved.append(faces)
         return potential(softmap, regularisation, faces)
 
-    monkeypatch.setattr(tracing, "potential", watched)
+    # The package's attribute of that name is the function.
+    monkeypatch.setattr(importlib.import_module("solver.trace"), "potential", watched)
     found = trace(identity, arc(identity.source.mesh)[:4], 5)
     (faces,) = solved
     assert set(found.source_faces) <= set(faces.tolist())
