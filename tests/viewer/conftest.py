@@ -97,8 +97,9 @@ class View:
         self.page.mouse.click(*self.place(side, vertex))
 
     def pixels(self, side: str) -> NDArray[np.float64]:
-        """What a view shows after its next frame, (height, width, 3) in 0…1."""
+        """What a view shows once all is still, (height, width, 3) in 0…1."""
         self.ask("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        self.until("() => softmaps.stage.resting")
         picture = self.page.locator(f"#canvas-{side}").screenshot()
         found: NDArray[np.float64] = imread(io.BytesIO(picture), format="png")[..., :3].astype(np.float64)
         return found

@@ -8,6 +8,7 @@ import { Paint } from "./paint.js";
 
 /** Radius of a marker as a part of half the view's height. */
 const MARKER = 0.018;
+const PIXEL_RATIO = Math.min(window.devicePixelRatio, 2);
 const BALL = new THREE.SphereGeometry(1, 20, 14);
 
 /** @typedef {{light: boolean, background: number, clay: number, wire: number}} Theme */
@@ -19,7 +20,10 @@ export class Pane {
     this.side = side;
     this.canvas = canvas;
     this.rig = rig;
-    this.renderer = rendererOf(canvas);
+    this.software = isSoftware();
+    this.renderer = rendererOf(canvas, !this.software);
+    /** Whether every pixel is drawn. */
+    this.fine = true;
     /** Whether something changed since it was drawn. */
     this.stale = true;
     this.scene = new THREE.Scene();
@@ -42,7 +46,8 @@ export class Pane {
   setSurface(surface) {
     if (this.mesh) {
       this.scene.remove(this.mesh);
-      this.mesh.geometry.dispose();
+      this.shapes.joined.dispose();
+      this.shapes.split?.dispose();
       this.paint?.dispose();
     }
     for (const group of [this.markers, this.curves, this.arrows]) clear(group);
@@ -50,7 +55,8 @@ export class Pane {
     this.mesh = this.paint = null;
     if (!surface) return;
     this.paint = new Paint(surface);
-    this.mesh = new THREE.Mesh(cornerGeometry(surface), this.paint.material);
+    this.shapes = { joined: joinedGeometry(surface), split: /** @type {?THREE.BufferGeometry} */ (null) };
+    this.mesh = new THREE.Mesh(this.shapes.joined, this.paint.material);
     this.mesh.frustumCulled = false;
     this.scene.add(this.mesh);
   }
@@ -142,26 +148,50 @@ export class Pane {
     }
   }
 
+  /** Corners of faces are needed for their own values and their edges only. */
+  #shape() {
+    const { domain, wires } = this.paint.material.uniforms;
+    if (domain.value !== 2 && wires.value === 0) return this.shapes.joined;
+    this.shapes.split ??= splitGeometry(this.surface);
+    return this.shapes.split;
+  }
+
   /** @param {?THREE.Object3D} arrows instead of those that are drawn */
   setArrows(arrows) {
     clear(this.arrows);
     if (arrows) this.arrows.add(arrows);
   }
 
+  /** Draw every pixel, or each as large as four while things move under a software renderer. @param {boolean} fine */
+  setDetail(fine) {
+    if (!this.software || fine === this.fine) return;
+    this.fine = fine;
+    this.renderer.setPixelRatio(fine ? PIXEL_RATIO : PIXEL_RATIO / 2);
+  }
+
   render() {
     this.stale = false;
+    if (this.mesh) this.mesh.geometry = this.#shape();
     for (const ball of this.markers.children) ball.scale.setScalar(MARKER * this.rig.reach);
     for (const line of /** @type {Line2[]} */ (this.curves.children)) line.material.resolution.set(this.width, this.height);
     this.renderer.render(this.scene, this.rig.camera(this.aspect));
   }
 }
 
-/** @param {HTMLCanvasElement} canvas */
-function rendererOf(canvas) {
-  // Smooth edges cost a software renderer more than everything else together.
-  const antialias = !isSoftware();
+/** Every vertex once: a sixth of the work of corners. @param {import("./surface.js").Surface} surface */
+function joinedGeometry({ positions, normals, faces, nVertices }) {
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+  geometry.setAttribute("normal", new THREE.BufferAttribute(normals, 3));
+  geometry.setAttribute("corner", new THREE.BufferAttribute(Float32Array.from({ length: nVertices }, (_, v) => v), 1));
+  geometry.setIndex(new THREE.BufferAttribute(Uint32Array.from(faces), 1));
+  return geometry;
+}
+
+/** @param {HTMLCanvasElement} canvas @param {boolean} antialias a software renderer spends more on it than on all else */
+function rendererOf(canvas, antialias) {
   const renderer = new THREE.WebGLRenderer({ canvas, antialias, powerPreference: "high-performance" });
-  renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
+  renderer.setPixelRatio(PIXEL_RATIO);
   return renderer;
 }
 
@@ -174,9 +204,9 @@ function isSoftware() {
   return /swiftshader|llvmpipe|software/i.test(name);
 }
 
-/** Every face with corners of its own, so that a face can be flat, have one value, and know its edges.
+/** Every face with corners of its own, so that it can have one value, and know its edges.
  *  @param {import("./surface.js").Surface} surface */
-function cornerGeometry({ positions, normals, faces }) {
+function splitGeometry({ positions, normals, faces }) {
   const n = faces.length;
   const [place, normal, corner] = [new Float32Array(3 * n), new Float32Array(3 * n), new Float32Array(n)];
   for (let k = 0; k < n; k++) {

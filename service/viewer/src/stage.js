@@ -6,6 +6,8 @@ import { Rig } from "./rig.js";
 /** Pixels that a click may move. */
 const CLICK_PIXELS = 4;
 const TURN_PER_PIXEL = 0.008;
+/** Milliseconds without a frame after which nothing moves. */
+const STILL = 300;
 const ZOOM_PER_NOTCH = 1.0015;
 
 /** @type {Record<string, import("./pane.js").Theme>} */
@@ -37,6 +39,9 @@ export class Stage {
     this.beforeFrame = () => {};
     /** Milliseconds of the last frames: from its start to the end of its drawing commands. */
     this.frames = /** @type {number[]} */ ([]);
+    /** When the last frame was drawn, and the timer of the one that follows when all is still. */
+    this.drawn = -STILL;
+    this.settling = 0;
     /** Where the pointer was since the last frame. @type {?{pane: Pane, x: number, y: number}} */
     this.pointer = null;
     for (const pane of this.panes) {
@@ -108,13 +113,33 @@ export class Stage {
   drawNow() {
     const began = performance.now();
     this.beforeFrame();
-    for (const pane of this.panes) if (pane.stale) pane.render();
+    const moving = began - this.drawn < STILL;
+    for (const pane of this.panes) {
+      if (!pane.stale) continue;
+      pane.setDetail(!moving);
+      pane.render();
+      this.drawn = performance.now();
+    }
+    clearTimeout(this.settling);
+    if (!this.resting) this.settling = window.setTimeout(() => this.#settle(), STILL);
     this.frames.push(performance.now() - began);
     if (this.frames.length > 600) this.frames.shift();
   }
 
+  /** Whether everything is drawn, with every pixel. */
+  get resting() {
+    return !this.asked && this.panes.every((pane) => pane.fine && !pane.stale);
+  }
+
+  /** Draw with every pixel what was drawn coarsely while it moved. */
+  #settle() {
+    const coarse = this.panes.filter((pane) => !pane.fine);
+    if (coarse.length) this.draw(...coarse);
+  }
+
   /** @returns {Promise<Blob>} both views as one PNG */
   picture() {
+    for (const pane of this.panes) pane.setDetail(true);
     const ratio = this.source.renderer.getPixelRatio();
     const whole = document.createElement("canvas");
     whole.width = Math.round((this.source.width + this.target.width) * ratio);
