@@ -61,12 +61,11 @@ void main() {
     }
   }
   if (tinted) base = mix(base, vTint.rgb, vTint.a);
-  vec3 eye = normalize(-vPosition);
-  float lit = max(dot(n, normalize(vec3(0.35, 0.55, 1.0))), 0.0);
-  float sky = 0.5 + 0.5 * n.y;
-  float rim = pow(1.0 - max(dot(n, eye), 0.0), 3.0);
-  float gleam = pow(max(dot(n, normalize(normalize(vec3(0.35, 0.55, 1.0)) + eye)), 0.0), 40.0);
-  vec3 shade = base * (0.42 + 0.5 * lit + 0.14 * sky) + 0.07 * gleam - 0.1 * rim * base;
+  // Light comes over the left shoulder; what faces away from the eye darkens.
+  const vec3 LIGHT = vec3(0.2988, 0.4695, 0.8308);
+  float lit = max(dot(n, LIGHT), 0.0);
+  float away = 1.0 - max(n.z, 0.0);
+  vec3 shade = base * (0.49 + 0.5 * lit + 0.07 * n.y - 0.1 * away * away * away);
   if (back) shade *= 0.55;
   if (wires > 0.0) {
     vec3 edge = vBarycentric / max(fwidth(vBarycentric), vec3(1e-6));
@@ -93,7 +92,7 @@ export class Paint {
       glslVersion: THREE.GLSL3,
       vertexShader: VERTEX,
       fragmentShader: FRAGMENT,
-      side: THREE.DoubleSide,
+      side: surface.solid ? THREE.FrontSide : THREE.DoubleSide,
       uniforms: {
         values: { value: this.values },
         tints: { value: this.tints },

@@ -5,9 +5,10 @@ import { Bvh } from "./bvh.js";
 
 export class Surface {
   /**
-   * @param {{id: string, name: string, vertices: Float64Array, faces: Int32Array}} mesh in the file's order and units
+   * @param {{id: string, name: string, vertices: Float64Array, faces: Int32Array, watertight: boolean}} mesh in the file's order
+   *   and units
    */
-  constructor({ id, name, vertices, faces }) {
+  constructor({ id, name, vertices, faces, watertight }) {
     this.id = id;
     this.name = name;
     this.vertices = vertices;
@@ -26,6 +27,8 @@ export class Surface {
     for (let k = 0; k < faces.length; k++) this.vertexAreas[faces[k]] += this.faceAreas[Math.floor(k / 3)] / 3;
     this.normals = vertexNormals(this.positions, faces);
     this.bvh = new Bvh(this.positions, faces);
+    /** Whether no face is ever seen from behind. */
+    this.solid = watertight && volume(this.positions, faces) > 0;
   }
 
   /** @param {ArrayLike<number>} point in the file's units @param {number} [at] @returns {[number, number, number]} */
@@ -82,6 +85,7 @@ export async function loadSurface(id) {
     name: manifest.values.name ?? id,
     vertices: /** @type {Float64Array} */ (vertices.data),
     faces: /** @type {Int32Array} */ (faces.data),
+    watertight: manifest.values.n_boundary_loops === 0 && manifest.values.warnings.length === 0,
   });
 }
 
@@ -110,6 +114,19 @@ function measured(vertices, faces) {
     for (let axis = 0; axis < 3; axis++) sum[axis] += (areas[face] * (a[axis] + b[axis] + c[axis])) / 3;
   }
   return { areas, total, centre: sum.map((x) => x / total) };
+}
+
+/** Six times the volume inside, if normals point outwards. @param {Float32Array} p @param {Int32Array} faces */
+function volume(p, faces) {
+  let sum = 0;
+  for (let k = 0; k < faces.length; k += 3) {
+    const [a, b, c] = [3 * faces[k], 3 * faces[k + 1], 3 * faces[k + 2]];
+    sum +=
+      p[a] * (p[b + 1] * p[c + 2] - p[b + 2] * p[c + 1]) +
+      p[a + 1] * (p[b + 2] * p[c] - p[b] * p[c + 2]) +
+      p[a + 2] * (p[b] * p[c + 1] - p[b + 1] * p[c]);
+  }
+  return sum;
 }
 
 /** @param {Float32Array} p @param {Int32Array} faces @returns {Float32Array} area-weighted unit normals */
