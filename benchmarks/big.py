@@ -113,7 +113,7 @@ def through_the_solver(source: Shape, target: Shape, size: int, threads: int) ->
 
 
 def through_the_service(source: Shape, target: Shape, size: int) -> None:
-    basis = {"kind": "basis", "size": size}
+    basis = {"kind": "basis", "method": "poisson", "size": size}
     with tempfile.TemporaryDirectory(prefix="softmaps-big-") as data:
         stack = Stack(Settings(data=Path(data), threads=1), workers=2, public=False)
         with stack, Client(stack.url) as client, horses(os.getpid()) as peaks:
@@ -129,7 +129,7 @@ def through_the_service(source: Shape, target: Shape, size: int) -> None:
             for artifact in client.lineage(job.id):
                 if artifact.spec is not None:
                     print(f"{artifact.kind:18}{artifact.seconds:9.2f}")
-            values = client.artifact(job.id).document["values"]
+            values = client.artifact(job.id).values
         print(f"most memory of a task {max(peaks.values()) / 1000:.0f} MB, of {len(peaks)} tasks")
         print(f"E_D = {values['dirichlet']:.9g}, E_b = {values['bijectivity']:.9g}")
 

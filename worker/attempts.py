@@ -234,7 +234,7 @@ class Attempts:
 
     # Acting
 
-    def enqueue(self, task: str, parents: Sequence[str], *, seconds: float, timeout: int) -> str:
+    def enqueue(self, task: str, parents: Sequence[str], *, interactive: bool, timeout: int) -> str:
         """Begin a new attempt of a task behind its parents' attempts; returns its name.
 
         Parameters
@@ -242,15 +242,15 @@ class Attempts:
         task : str
         parents : sequence of str
             RQ ids of attempts that must end first.
-        seconds : float
-            Estimate, which chooses the queue.
+        interactive : bool
+            Whether it belongs in the queue of short tasks.
         timeout : int
             Seconds after which the run is given up.
         """
         name = f"{task}-{secrets.token_hex(4)}"
         # Named before it exists: a crash in between leaves a name without attempt, replaced later
         self.connection.set(self.key("task", task), name)
-        self.queues["interactive" if seconds < INTERACTIVE_SECONDS else "batch"].enqueue_call(
+        self.queues["interactive" if interactive else "batch"].enqueue_call(
             FUNCTION,
             args=(task,),
             job_id=name,

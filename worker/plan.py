@@ -15,7 +15,7 @@ from typing import Final
 import redis
 
 from worker import library, sizes, specs
-from worker.attempts import Attempt, Attempts
+from worker.attempts import INTERACTIVE_SECONDS, Attempt, Attempts
 from worker.fields import kind_of
 from worker.library import Library
 from worker.settings import Settings
@@ -253,7 +253,9 @@ class Planner:
             self._write(node, record.tasks if record else (_task(node),), asked=False)
         parents = [names[parent] for parent in node.parents if parent in names]
         timeout = max(TIMEOUT_FLOOR, round(TIMEOUT_FACTOR * node.cost.seconds))
-        name = self._attempts.enqueue(node.id, parents, seconds=node.cost.seconds, timeout=timeout)
+        # Shards may be short, but a long solve has many: they must not keep short questions waiting.
+        interactive = node.cost.seconds < INTERACTIVE_SECONDS and not node.spec.private
+        name = self._attempts.enqueue(node.id, parents, interactive=interactive, timeout=timeout)
         if attempt.died:
             _log.warning("%s: its worker died; it runs again as %s", node.id, name)
         return name

@@ -163,7 +163,9 @@ def softmap_cost(spec: specs.SoftMap, sizes: Sizes) -> Cost:
     memory = 4 * _FLOAT * entries + 2_000 * (source.mesh.n_vertices + target.mesh.n_vertices)
     if isinstance(spec.map, specs.Descriptors):
         _, columns = sizes.descriptor(spec.map.source)
-        seconds += 1.1e-8 * source.mesh.n_vertices * target.mesh.n_vertices
+        # Each pair of vertices costs an exponential, and a multiplication for each function on its tile.
+        nearby = min(target.n_functions, 40 + 3_000 * target.n_functions / target.mesh.n_vertices)
+        seconds += (8e-9 + 6e-11 * nearby) * source.mesh.n_vertices * target.mesh.n_vertices
         # Descriptors scaled, centred and turned, and 3 MB a thread, for sixteen threads.
         memory += 4 * _FLOAT * columns * (source.mesh.n_vertices + target.mesh.n_vertices) + 50_000_000
         memory += 16 * 4 * _FLOAT * 256 * target.n_functions

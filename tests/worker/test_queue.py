@@ -358,3 +358,16 @@ def test_metrics_are_numbers(dispatcher: Dispatcher, mesh: str) -> None:
     assert metrics["tasks_queued_interactive"] == 1
     assert metrics["tasks_deferred"] == 2
     assert metrics["workers"] == dispatcher.workers() == 0
+
+
+def test_shards_never_stand_in_the_queue_of_short_tasks(
+    settings: Settings, store: Store, connection: redis.Redis
+) -> None:
+    eager = settings.model_copy(update={"shard_seconds": 1e-6})
+    job = ask(Dispatcher(eager, store, connection), **energy(put_mesh(store, icosphere(4)), 20))
+    origins = {attempt.args[0]: attempt.origin for attempt in attempts_of(connection)}
+    shards = [task.id for task in job.tasks if task.kind == "energy_block"]
+    short = [task.id for task in job.tasks if task.kind in {"basis", "softmap"}]
+    assert len(shards) == 2 and short
+    assert all("batch" in origins[shard] for shard in shards)
+    assert all("interactive" in origins[id_] for id_ in short)

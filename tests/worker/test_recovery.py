@@ -200,7 +200,7 @@ def test_a_run_that_is_deaf_to_its_deadline_is_ended(
     job = solve(dispatcher, mesh, 150)
     attempts = dispatcher._attempts
     attempts.forget(job.id, attempts.current([job.id])[job.id].name)
-    attempts.enqueue(job.id, [], seconds=5.0, timeout=1)
+    attempts.enqueue(job.id, [], interactive=False, timeout=1)
     horse = workers.horse(workers.start())
     failed = finished(dispatcher, job.id)
     assert failed.error is not None
