@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -132,18 +133,44 @@ def fail(store: Store, id_: str, found: Problem, *, started_at: str | None = Non
     started_at : str, optional
         When its job began to run.
     """
-    if store.has(id_):
-        return
-    finished_at = now()
+    if not store.has(id_):
+        _end(store, id_, outcome="failed", problem=found, started_at=started_at, finished_at=now())
+
+
+def fail_dependants(store: Store, id_: str, found: Problem, *, started_at: str | None) -> None:
+    """Fail all open jobs that read what has failed, and drop the other shards of the same whole.
+
+    They would find out by themselves, but only when their last parent has ended, perhaps hours later.
+
+    Parameters
+    ----------
+    store : Store
+    id_ : str
+        Of the task that failed.
+    found : dict
+        Why.
+    started_at : str or None
+        When that task's job began to run.
+    """
+    known = Library(store)
+    records = list(store.open_jobs())
+    failed = {id_: found}
+    while failed:
+        cause, why = failed.popitem()
+        for record in records:
+            if cause in needs_of(record, known):
+                inner = failed[record.id] = inherited(cause, why)
+                fail(store, record.id, inner, started_at=started_at)
+                for shard in planned_shards(record):
+                    _end(store, shard, outcome="dismissed", finished_at=now())
+        records = [record for record in records if record.id not in failed]
+
+
+def _end(store: Store, id_: str, **fields: Any) -> None:
+    """Give a job its outcome, unless it has one."""
 
     def change(record: JobRecord) -> JobRecord:
-        if record.outcome is not None:
-            return record
-        return replace(
-            record, outcome="failed", problem=found, started_at=started_at, finished_at=finished_at
-        )
+        return record if record.outcome is not None else replace(record, **fields)
 
-    try:
+    with suppress(UnknownJob):
         store.update_job(id_, change)
-    except UnknownJob:
-        return

@@ -207,7 +207,9 @@ class Workplace:
         """Record a failure."""
         record = self.store.job(task)
         if record is not None:
-            library.fail(self.store, task, found, started_at=self._begun(record))
+            started_at = self._begun(record)
+            library.fail(self.store, task, found, started_at=started_at)
+            library.fail_dependants(self.store, task, found, started_at=started_at)
             _log.info("%s: failed: %s", task, found["detail"])
 
     def _begun(self, record: JobRecord) -> str | None:

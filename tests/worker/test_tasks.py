@@ -188,7 +188,7 @@ def test_shards_make_the_same_bits(
 def test_a_failed_shard_fails_the_whole_for_its_own_reason(
     settings: Settings, store: Store, connection: redis.Redis
 ) -> None:
-    """Two functions at one place are dependent: no face has a solution."""
+    """Two functions at one place are dependent: no face has a solution. Nobody tries the other faces then."""
     eager = settings.model_copy(update={"shard_seconds": 1e-6})
     dispatcher, place = Dispatcher(eager, store, connection), Workplace(eager)
     sphere = icosphere(4)
@@ -212,7 +212,10 @@ def test_a_failed_shard_fails_the_whole_for_its_own_reason(
     failed = seen(dispatcher, job.id)
     assert failed.error is not None
     assert failed.error["type"] != "urn:softmaps:parent-failed"
-    assert failed.error["task"].startswith("energy_block-")
+    shards = [task for task in failed.tasks if task.kind == "energy_block"]
+    assert failed.error["task"] == shards[0].id
+    assert [shard.status for shard in shards] == ["failed", "dismissed"]
+    assert not list(store.open_jobs())
 
 
 def put_basis(store: Store, spec: specs.Basis, functions: np.ndarray) -> None:
