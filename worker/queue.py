@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -378,6 +379,8 @@ class Dispatcher:
         """Numbers for those who watch this service, by name."""
         counts = self._attempts.counts()
         workers = self._attempts.presence.workers()
+        records = list(self._store.open_jobs())
+        statuses = Counter(job.status for job in self._views.jobs([each for each in records if each.asked]))
         return {
             "workers": len(workers),
             "workers_interactive": sum(worker.interactive for worker in workers),
@@ -385,5 +388,7 @@ class Dispatcher:
             "tasks_queued_interactive": counts["interactive"],
             "tasks_queued_batch": counts["batch"],
             "tasks_deferred": counts["deferred"],
-            "jobs_open": sum(1 for _ in self._store.open_jobs()),
+            "jobs_open": len(records),
+            "jobs_accepted": statuses["accepted"],
+            "jobs_running": statuses["running"],
         }

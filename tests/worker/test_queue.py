@@ -355,6 +355,7 @@ def test_metrics_are_numbers(dispatcher: Dispatcher, mesh: str) -> None:
     ask(dispatcher, **energy(mesh, 20))
     metrics = dispatcher.metrics()
     assert metrics["jobs_open"] == 3
+    assert (metrics["jobs_accepted"], metrics["jobs_running"]) == (1, 0)  # what was asked for
     assert metrics["tasks_queued_interactive"] == 1
     assert metrics["tasks_deferred"] == 2
     assert metrics["workers"] == dispatcher.workers() == 0
