@@ -132,7 +132,9 @@ def basis_cost(spec: specs.Basis, sizes: Sizes) -> Cost:
         # Discs around samples have 2.4 h for radius, or more where functions are blunt.
         discs = max(1.0, 3 / spec.sharpness)
         return Cost(seconds + 4e-5 * n_vertices * discs, memory + round(2_500 * n_vertices * discs))
-    return Cost(seconds + 1.9e-6 * n_vertices**1.5 / spec.size**0.5, memory)
+    # A cell and its ring are seven cells; few functions mean large systems.
+    patch = min(n_vertices, 7 * n_vertices / spec.size)
+    return Cost(seconds + 2.4e-8 * spec.size * patch**1.75, memory)
 
 
 def spectrum_cost(spec: specs.Spectrum, sizes: Sizes) -> Cost:
