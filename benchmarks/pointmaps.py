@@ -87,13 +87,11 @@ def measure(pair: str, folder: Path, size: int, count: int) -> None:
     symmetric = folder / name / "gt_sym.txt"
     twin = np.loadtxt(symmetric, dtype=np.int64) if symmetric.exists() else None
     pairs = landmarks(source, truth, count)
-    some = np.linspace(0, source.n_vertices - 1, SOURCES).astype(np.int64)
+    known = [each for each in (truth, twin) if each is not None]
+    sure = np.flatnonzero(np.all([each >= 0 for each in known], axis=0))
+    some = sure[np.linspace(0, sure.size - 1, SOURCES).astype(np.int64)]
     # One field of distances a source vertex and truth serves all maps.
-    fields = [
-        np.stack([distances_from(target, int(vertex)) for vertex in known[some]])
-        for known in (truth, twin)
-        if known is not None
-    ]
+    fields = [np.stack([distances_from(target, int(vertex)) for vertex in each[some]]) for each in known]
     ways: dict[str, Callable[[], dict[str, IntArray]]] = {
         "nearest profile": lambda: nearest_profile(source, target, pairs),
         "functional map": lambda: functional_map(source, target, pairs),
