@@ -18,7 +18,7 @@ from solver.rowblocks import RowBlocks, RowModel
 #: Conjugate gradients stop when the residual, in the norm of the preconditioner, has fallen this far …
 ACCURACY = 0.1
 #: … or after so many iterations.
-LONGEST = 60
+LONGEST = 40
 #: Share of the largest eigenvalue below which constraints depend on one another.
 DEPENDENT = 1e-12
 #: Least curvature along a step, relative to the model's, that still corrects it.
