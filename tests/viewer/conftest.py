@@ -59,7 +59,7 @@ class View:
         """What a function of the page returns as soon as it is true."""
         deadline = time.monotonic() + SECONDS
         while not (found := self.ask(script, argument)):
-            assert time.monotonic() < deadline, f"in vain: {script}\n{self.page.inner_text('#panels')}"
+            assert time.monotonic() < deadline, f"in vain: {script}\n{self.page.inner_text('main')}"
             self.page.wait_for_timeout(30)
         return found
 

@@ -1,6 +1,8 @@
 /** A bounding-volume hierarchy over triangles: which face a ray meets first. */
 
 const LEAF_SIZE = 6;
+/** How far outside a face a ray still meets it, in barycentric coordinates: none may slip between neighbours. */
+const SLACK = 1e-6;
 
 /** @typedef {{face: number, barycentric: [number, number, number], distance: number}} Hit */
 
@@ -125,10 +127,10 @@ export class Bvh {
     if (determinant === 0) return;
     const [tx, ty, tz] = [o[0] - p[a], o[1] - p[a + 1], o[2] - p[a + 2]];
     const u = (tx * px + ty * py + tz * pz) / determinant;
-    if (u < 0 || u > 1) return;
+    if (u < -SLACK || u > 1 + SLACK) return;
     const [qx, qy, qz] = [ty * e1z - tz * e1y, tz * e1x - tx * e1z, tx * e1y - ty * e1x];
     const v = (d[0] * qx + d[1] * qy + d[2] * qz) / determinant;
-    if (v < 0 || u + v > 1) return;
+    if (v < -SLACK || u + v > 1 + SLACK) return;
     const distance = (e2x * qx + e2y * qy + e2z * qz) / determinant;
     if (distance <= 0 || distance >= hit.distance) return;
     hit.face = face;

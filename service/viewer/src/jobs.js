@@ -4,7 +4,7 @@ import { FINISHED, Refused, dismiss, follow, jobs as recent, submit } from "./ap
 import { h } from "./dom.js";
 
 /** Jobs of earlier visits that are listed. */
-const LISTED = 8;
+const LISTED = 5;
 /** What a person may do about a refusal, by status. @type {Record<number, string>} */
 const ADVICE = {
   404: "It may have been forgotten: compute it again.",

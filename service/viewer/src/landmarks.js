@@ -101,7 +101,9 @@ export class Landmarks {
     this.course.push({ energy, gap });
     this.#draw();
     const coefficients = await snapshot(job.id);
-    if (coefficients) this.viewer.preview(new SoftMap(null, source, target, coefficients));
+    if (!coefficients) return;
+    this.viewer.preview(new SoftMap(null, source, target, coefficients));
+    if (this.viewer.brush.vertex < 0 && this.pairs.length) this.viewer.brush.moveTo(this.pairs[0][0]);
   }
 
   /** @returns {import("./tools.js").Tool} */

@@ -72,7 +72,7 @@ export class Rig {
     const [across, upright] = ends;
     this.centre.set(0, 0, 0).addScaledVector(x, across.middle).addScaledVector(y, upright.middle);
     // What is nearer than the centre looks larger, and the colour bars want room.
-    this.reach = 1.22 * Math.max(upright.half, across.half / aspect);
+    this.reach = 1.3 * Math.max(upright.half, across.half / aspect);
   }
 
   /** A new camera of this rig. @param {number} aspect width / height */

@@ -106,7 +106,7 @@ export class Viewer {
   preview(softmap) {
     if (softmap.source.surface !== this.stage.source.surface || softmap.target.surface !== this.stage.target.surface) return;
     this.brush.setSoftMap(softmap);
-    if (this.brush.shown) this.showBrush();
+    if (this.brush.shown || !this.softmap) this.showBrush();
   }
 
   /** Let the target show μ_x. @param {Partial<import("./layers.js").Scale>} [scale] */
