@@ -52,9 +52,7 @@ document.addEventListener("keydown", (event) => {
 // For the console, and for whoever measures.
 /** @type {any} */ (window).softmaps = viewer;
 
-try {
-  await Promise.all([question.refresh(), jobs.remember()]);
-  await viewer.open();
-} catch (error) {
-  viewer.say(inWords(error));
+// What cannot be listed keeps nobody from looking.
+for (const one of await Promise.allSettled([viewer.open(), question.refresh(), jobs.remember()])) {
+  if (one.status === "rejected") viewer.say(inWords(one.reason));
 }
