@@ -173,7 +173,8 @@ def identity(client: Client, ball_file: Path) -> str:
     return client.wait(client.submit(spec | {"map": {"type": "points", "targets": targets.id}}).id).id
 
 
-@pytest.fixture(scope="session")
+# Not for the session: Playwright's loop runs in this thread while it is there, and other tests start their own.
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     with sync_playwright() as playwright:
         running = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)

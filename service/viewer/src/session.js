@@ -33,7 +33,10 @@ export class Viewer {
       source: new Layer(this.stage.source, overlays.source, () => this.stage.draw(this.stage.source)),
       target: new Layer(this.stage.target, overlays.target, () => this.stage.draw(this.stage.target)),
     };
-    this.headings = { source: h("h2"), target: h("h2") };
+    this.headings = {
+      source: h("h2", {}, h("span", { class: "empty" }, "Drop the source mesh here, or take the built-in pair")),
+      target: h("h2", {}, h("span", { class: "empty" }, "Drop the target mesh here")),
+    };
     /** Where the brush is; an element, so that moving it draws no surface anew. */
     this.cursor = h("div", { class: "cursor", hidden: true });
     overlays.source.append(this.cursor);
