@@ -173,7 +173,7 @@ def identity(client: Client, ball_file: Path) -> str:
     return client.wait(client.submit(spec | {"map": {"type": "points", "targets": targets.id}}).id).id
 
 
-# Not for the session: Playwright's loop runs in this thread while it is there, and other tests start their own.
+# Not for the session: Playwright's loop runs in this thread, and other tests start loops of their own.
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     with sync_playwright() as playwright:
