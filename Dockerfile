@@ -31,7 +31,8 @@ FROM base AS tests
 COPY --chown=softmaps pyproject.toml ./
 COPY --chown=softmaps tests tests
 # What the story needs beside the service itself; the home folder is the user's, /opt is not.
-RUN pip install --no-cache-dir --user --only-binary=:all: "pytest>=9,<10" "pytest-xdist>=3.8,<4"
+RUN pip install --no-cache-dir --user --only-binary=:all: "pytest>=9,<10" "pytest-benchmark>=5.3,<6" \
+    "pytest-xdist>=3.8,<4"
 CMD ["python", "-m", "pytest", "-n0", "tests/test_story.py"]
 
 
