@@ -174,13 +174,9 @@ def potential(
     json: Json = False,
 ) -> None:
     """Transportation potentials of all source faces; --out writes them (F₀×2×n) with their frames."""
-    screen = Screen(json)
     bases = BasisOptions(method=method, cutoff=cutoff, sharpness=sharpness)
     pair = Pair(source, target, map, size, bases, sigma)
-    with asking(screen, url, data, pair) as client:
-        asked, _ = pair.softmap(client)
-        spec = {"kind": "potential", "softmap": asked, "regularisation": regularisation}
-        finish(client, screen, answered(client, screen, spec, "potential"), out)
+    finish_of(pair, {"kind": "potential", "regularisation": regularisation}, Screen(json), url, data, out)
 
 
 @contextmanager
@@ -193,6 +189,16 @@ def asking(screen: Screen, url: str | None, data: Path | None, pair: Pair | None
             pair.numbers()  # a file that holds no map is not worth starting a service for
         with service_of(settings, url, screen.say) as client:
             yield client
+
+
+def finish_of(
+    pair: Pair, question: dict[str, Any], screen: Screen, url: str | None, data: Path | None, out: Path | None
+) -> None:
+    """Ask a question of the soft map of a pair, to its end."""
+    with asking(screen, url, data, pair) as client:
+        asked, _ = pair.softmap(client)
+        spec = {**question, "softmap": asked}
+        finish(client, screen, answered(client, screen, spec, question["kind"]), out)
 
 
 def finish(client: Client, screen: Screen, answer: Artifact, out: Path | None) -> None:

@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
-from service.answering import asking, finish
+from service.answering import finish_of
 from service.asking import BasisOptions
-from service.commands import Pair, answered, vertices_option
+from service.commands import Pair, vertices_option
 from service.console import Screen
 from service.options import (
     Cutoff,
@@ -47,14 +47,15 @@ def momentum(
     json: Json = False,
 ) -> None:
     """How mass moves on TARGET as a point of SOURCE moves; --out writes velocity and momentum (F×3)."""
-    screen = Screen(json)
     bases = BasisOptions(method=method, cutoff=cutoff, sharpness=sharpness)
     pair = Pair(source, target, map, size, bases, sigma)
-    with asking(screen, url, data, pair) as client:
-        asked, _ = pair.softmap(client)
-        question = {"face": face, "direction": list(direction), "regularisation": regularisation}
-        spec = {"kind": "momentum", "softmap": asked, **question}
-        finish(client, screen, answered(client, screen, spec, "momentum"), out)
+    question = {
+        "kind": "momentum",
+        "face": face,
+        "direction": list(direction),
+        "regularisation": regularisation,
+    }
+    finish_of(pair, question, Screen(json), url, data, out)
 
 
 def path(
@@ -79,15 +80,16 @@ def path(
     json: Json = False,
 ) -> None:
     """Path on TARGET that follows a path on SOURCE; --out writes its points (k×3) and where they are."""
-    screen = Screen(json)
     bases = BasisOptions(method=method, cutoff=cutoff, sharpness=sharpness)
     pair = Pair(source, target, map, size, bases, sigma)
-    with asking(screen, url, data, pair) as client:
-        asked, _ = pair.softmap(client)
-        passed = [int(vertex) for vertex in source_path.split(",")]
-        question = {"source_path": passed, "start": start, "step": step, "regularisation": regularisation}
-        spec = {"kind": "path", "softmap": asked, **question}
-        finish(client, screen, answered(client, screen, spec, "path"), out)
+    question = {
+        "kind": "path",
+        "source_path": [int(vertex) for vertex in source_path.split(",")],
+        "start": start,
+        "step": step,
+        "regularisation": regularisation,
+    }
+    finish_of(pair, question, Screen(json), url, data, out)
 
 
 def pointmap(
@@ -108,10 +110,6 @@ def pointmap(
     json: Json = False,
 ) -> None:
     """Target vertex of every vertex of SOURCE; --out writes them with their confidence (V₀)."""
-    screen = Screen(json)
     bases = BasisOptions(method=method, cutoff=cutoff, sharpness=sharpness)
     pair = Pair(source, target, map, size, bases, sigma)
-    with asking(screen, url, data, pair) as client:
-        asked, _ = pair.softmap(client)
-        spec = {"kind": "pointmap", "softmap": asked, "method": by}
-        finish(client, screen, answered(client, screen, spec, "pointmap"), out)
+    finish_of(pair, {"kind": "pointmap", "method": by}, Screen(json), url, data, out)
