@@ -19,7 +19,7 @@ from service.creature import creature
 from service.options import Json
 from service.parsing import InvalidFile, Limits, read_mesh
 from service.rivals import face_systems, rivals, timed
-from worker.settings import Settings
+from worker.settings import Settings, usable_cores
 
 if TYPE_CHECKING:
     from solver import SoftMap
@@ -170,8 +170,6 @@ def bench(
     json: Json = False,
 ) -> None:
     """Measure the solver on this machine, in turns with LAPACK, SuperLU and (if installed) CHOLMOD."""
-    from worker.tasks import usable_cores  # noqa: PLC0415  (the command line starts without)
-
     screen = Screen(json)
     if (source is None) != (target is None):
         raise typer.BadParameter("name a target as well as a source, or neither")
@@ -283,8 +281,6 @@ def _sizes(softmap: SoftMap) -> dict[str, int]:
 
 def _processor() -> str:
     """What the processor calls itself, and how many of its cores may be used."""
-    from worker.tasks import usable_cores  # noqa: PLC0415
-
     name = platform.processor() or platform.machine()
     if os.path.exists("/proc/cpuinfo"):  # noqa: PTH110  (Linux alone)
         with open("/proc/cpuinfo") as lines:  # noqa: PTH123

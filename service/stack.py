@@ -19,7 +19,7 @@ from pydantic import SecretStr
 
 from service.embedded import EmbeddedRedis
 from service.supervisor import Child, Plan, module
-from worker.settings import Settings
+from worker.settings import Settings, usable_cores
 
 #: Longest a stack may take to be ready; the first time, kernels are compiled meanwhile.
 START_SECONDS = 300.0
@@ -83,7 +83,7 @@ class Stack:
         public: bool = True,
         report: Callable[[str], None] = lambda phase: None,
     ) -> None:
-        cores = available_cores()
+        cores = usable_cores()
         self.workers = workers or max(1, cores // 4)
         self.threads = settings.threads or max(1, cores // self.workers)
         self.settings, self._public, self._report = settings, public, report
@@ -274,13 +274,6 @@ def running(data: Path) -> str | None:
     except OSError:
         pass
     return None
-
-
-def available_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _until(event: threading.Event) -> None:

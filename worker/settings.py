@@ -20,6 +20,11 @@ def _absolute(path: Path) -> Path:
     return path.expanduser().absolute()
 
 
+def usable_cores() -> int:
+    """Cores that this process may use, which is what unset threads mean."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class Settings(BaseSettings):
     """Everything that can be configured; read from the environment when it is made, then frozen.
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import logging
-import os
 import platform
 import time
 from collections.abc import Mapping
@@ -27,7 +26,7 @@ from worker.jobs import Step
 from worker.library import Library, Problem
 from worker.plan import MAX_DEATHS, died
 from worker.readers import Reader
-from worker.settings import Settings
+from worker.settings import Settings, usable_cores
 from worker.stages import stage
 from worker.store import JobRecord, Store, StoreError, now
 
@@ -306,11 +305,6 @@ def memory(task: str, limit: int) -> Problem:
 def _words(error: Exception) -> str:
     """What a fault is, without the paths that only this machine's owner may see."""
     return (error.strerror if isinstance(error, OSError) else None) or type(error).__name__
-
-
-def usable_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @cache
